@@ -25,11 +25,7 @@ class _SensorConfig(NamedTuple):
 
 
 class SceneRenderer:
-    """Renderer of the measurements of a scene's sensors, each when it is first needed.
-
-    All effects are simulated, except those that the scene switches off. This takes longer than rendering only the
-    relevant effects, but much less time than determining them.
-    """
+    """Renderer of the measurements of a scene's sensors, each when it is first needed."""
 
     def __init__(self, scene: "Scene") -> None:
         self._scene = scene

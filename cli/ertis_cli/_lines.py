@@ -12,11 +12,9 @@ _CLOSED_S = 5.0
 
 
 class JsonLines:
-    """Stream whose writer never waits for the reader, because a thread writes the texts in order.
+    """Stream whose writer never waits for the reader, because a thread writes the texts in order."""
 
-    At most ``largest`` texts wait; further ones are dropped and counted. A stream without a file descriptor, as in
-    tests, is written directly.
-    """
+    # At most `largest` texts wait; further ones are dropped. A stream without a descriptor is written directly.
 
     def __init__(self, stream: IO[str], *, largest: int = _MAX) -> None:
         self._stream = stream

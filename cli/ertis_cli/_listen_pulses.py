@@ -54,11 +54,8 @@ def listen_pulses(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show each pulse until a signal, a count or a duration ends the command; no sensors means all.
-
-    ``of`` names the shown item in the singular, and the items that may be dropped in the plural; at_end is always
-    called.
-    """
+    """Show each pulse until a signal, a count or a duration ends the command; no sensors means all."""
+    # `of` names the shown item in the singular, and dropped ones in the plural; `at_end` is always called.
     notes: deque[str] = deque()
     heard = ProductTable(as_json=as_json, quiet=quiet)
     with stopped_by_signals() as signals, connect(notes.append) as subscriber:

@@ -131,11 +131,8 @@ def named(message: str, ctx: click.Context) -> str:
 
 
 def with_options(message: str, ctx: click.Context | None = None) -> str:
-    """Return a message of the package with the options of the running command in place of parameters of Python.
-
-    ``overwrite=True`` becomes ``--force``, ``length_s`` becomes ``--length``, and ``(sensor)`` becomes ``(--sensor)``.
-    Threads other than the main one have no current context, and must pass that of their command.
-    """
+    """Return a message of the package with the options of the running command in place of parameters of Python."""
+    # `overwrite=True` becomes `--force`. Threads other than the main one must pass the context of their command.
     ctx = ctx or click.get_current_context(silent=True)
     if ctx is None:
         return message

@@ -127,10 +127,8 @@ def _without_controls(text: str) -> str:
 
 
 def draw_without_display() -> None:
-    """Let Matplotlib ignore MPLBACKEND, which may name a missing window system or notebook.
-
-    Commands only write files. Scripts of users get the variable back by `restore_display`.
-    """
+    """Let Matplotlib ignore MPLBACKEND, which may name a missing window system or notebook."""
+    # It may name a missing window system. Scripts of users get the variable back by `restore_display`.
     os.environ["MPLBACKEND"] = "agg"
 
 

@@ -163,10 +163,7 @@ def pulse_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, Stampe
 
 
 def _require_one_chain(places: "Sequence[StampedIndex]", groups: "Sequence[dict[str, StampedIndex]]") -> None:
-    """Raise DataError if two sensors share a pulse, but have another SYNC count at different times.
-
-    Only counts that each sensor has once in a session are compared, since others do not identify a pulse.
-    """
+    """Raise DataError if two sensors share a pulse, but have another SYNC count at different times."""
     from ertis_numba.base.errors import DataError
     from ertis_numba.fusion.pulses import is_same_pulse
 
@@ -202,11 +199,8 @@ class ActiveGroups:
 def active_groups(
     readers: "Sequence[RecordingReader]", changed: "Callable[[Settings], Settings]", *, quiet: bool
 ) -> ActiveGroups:
-    """Return the measurements of each pulse in which a sensor emitted its call, by sensor.
-
-    A sensor that was silent in such a pulse hears the echoes of the others, so its measurement belongs to the pulse. A
-    note states the number of other pulses. `is_passive` decides with the changed settings.
-    """
+    """Return the measurements of each pulse in which a sensor emitted its call, by sensor."""
+    # A sensor that was silent in such a pulse hears the echoes of the others. A note states the number of other pulses.
     from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
 

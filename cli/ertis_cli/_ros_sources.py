@@ -90,11 +90,8 @@ def publish_file(
     on_ready: Callable[[], None],
     signals: Signals,
 ) -> None:
-    """Publish images of a file at the publisher's speed; on_passive gets the number of those without a call.
-
-    With ``sim_time``, the stamps are those of the file, and ``/clock`` has the same time; otherwise the stamps are the
-    present. A DataError is raised if no measurement has a call.
-    """
+    """Publish images of a file at the publisher's speed; on_passive gets the number of those without a call."""
+    # With `sim_time`, stamps are those of the file, as on `/clock`; otherwise the present. DataError without a call.
     from dataclasses import replace
 
     from ertis_cli import options

@@ -24,10 +24,7 @@ Write = Callable[["Arrival"], None]
 
 @contextmanager
 def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
-    """Yield the folders that do not exist yet; if the block raises an error, remove those left in the list.
-
-    A folder that contains more than a central node's own files stays.
-    """
+    """Yield the folders that do not exist yet; if the block raises an error, remove those left in the list."""
     missing = [each for folder in folders if folder for each in (folder, *folder.parents) if not each.exists()]
     try:
         yield missing

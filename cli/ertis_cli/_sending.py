@@ -58,10 +58,7 @@ class _Watch(Watch):
 
 
 class Sending:
-    """Capture whose measurements go to a central node, with limits of spool and memory in MB or None.
-
-    ``is_fixed`` refuses new settings from admins; ``report`` is complete once `run` has returned.
-    """
+    """Capture whose measurements go to a central node, with limits of spool and memory in MB or None."""
 
     def __init__(
         self,

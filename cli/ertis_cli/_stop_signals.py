@@ -121,10 +121,8 @@ def obey_signals() -> None:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process like `sys.exit`, but without finalising the interpreter, as processes of multiprocessing do.
-
-    Libraries that a signal has interrupted, in an import for example, may crash when they are finalised.
-    """
+    """End the process like `sys.exit`, but without finalising the interpreter, as processes of multiprocessing do."""
+    # Libraries that a signal has interrupted, in an import for example, may crash when they are finalised.
     try:
         threading._shutdown()  # type: ignore[attr-defined]  # noqa: SLF001
         atexit._run_exitfuncs()  # noqa: SLF001
@@ -136,10 +134,9 @@ def leave(code: int) -> NoReturn:
 
 
 class Signals:
-    """Signals that have arrived, and the function that stops the program, given to `obey` even afterwards.
+    """Signals that have arrived, and the function that stops the program, given to `obey` even afterwards."""
 
-    A signal never interrupts running code, because a library that is loading would swallow the exception or fail.
-    """
+    # It never interrupts running code, because a library that is loading would swallow the exception or fail.
 
     def __init__(self) -> None:
         self.came: list[int] = []

@@ -61,10 +61,7 @@ def allow() -> None:
 
 
 def supervised() -> Life:
-    """Return in a child process, once per start; the parent waits, and exits with the last child's code.
-
-    On other systems than Linux, and in other programs, this returns in the calling process.
-    """
+    """Return in a child process, once per start; the parent waits, and exits with the last child's code."""
     if not _allowed:
         return Life()
     supervisor = _Supervisor()

@@ -274,10 +274,7 @@ def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: boo
 
 
 class _Estimate:
-    """Estimate of time and memory of a long task from its first steps, reported once.
-
-    The time of the first ``n_first`` steps does not count, because they also prepare the following ones.
-    """
+    """Estimate of time and memory of a long task from its first steps, reported once."""
 
     def __init__(self, n_steps: int, *, n_first: int, clock: "Callable[[], float]" = time.monotonic) -> None:
         self._n_steps, self._n_first, self._clock = n_steps, n_first, clock

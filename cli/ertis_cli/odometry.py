@@ -118,10 +118,7 @@ def odometry_of(
     alone: bool | None = None,
     quiet: bool,
 ) -> "Odometry":
-    """Return the odometry of pulses, under a progress bar.
-
-    A sensor without a call hears the echoes of others, whose paths begin elsewhere. Its images are left out.
-    """
+    """Return the odometry of pulses, under a progress bar."""
     from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
     from ertis_numba.motion import Odometry

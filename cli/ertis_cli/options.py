@@ -164,10 +164,7 @@ settings_file: Decorator = click.option(
 
 
 def beamforming(default: str = "") -> Decorator:
-    """Return the options of beamformers and weightings, named like the fields of `Processing`.
-
-    ``default`` ends the help of each option, unless a heading above them states the default.
-    """
+    """Return the options of beamformers and weightings, named like the fields of `Processing`."""
     about = "; ".join(
         f"{name.removeprefix(f'{beamformer}_')}: {option.help}, {option.limits}"
         for beamformer, declared in BEAMFORMERS.items()
@@ -326,11 +323,8 @@ def settings_with(
     elevation: tuple[float, float] | float | None = None,
     **options: Any,
 ) -> "Settings":
-    """Return recorded settings, updated from a file, a preset and then options named as in `Processing`.
-
-    A layout or positions in the file replace the whole array. ``elevation`` is that of a grid of one elevation, or
-    limits.
-    """
+    """Return recorded settings, updated from a file, a preset and then options named as in `Processing`."""
+    # A layout or positions in the file replace the whole array.
     from ertis_numba.settings import preset_tables
 
     settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
@@ -413,10 +407,7 @@ def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
-    """Print a note for each sensor whose sound contradicts its settings, or whose array cannot observe some angles.
-
-    Fused images have no array of their own. There is a note if their points are missing.
-    """
+    """Print a note for each sensor whose sound contradicts its settings, or whose array cannot observe some angles."""
     from ertis_numba.storage import open_energyscapes
 
     for name in sensors:

@@ -319,11 +319,8 @@ def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Itera
 
 @contextmanager
 def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False) -> Iterator[None]:
-    """Print a message if the block takes long, and delay signals until its end; the second one ends the process.
-
-    An exception inside the compiler may crash it or get lost, and the interpreter crashes if it exits meanwhile. If
-    ``ending`` is True, the first signal counts as the second.
-    """
+    """Print a message if the block takes long, and delay signals until its end; the second one ends the process."""
+    # The interpreter crashes if it exits during a compilation. If `ending`, the first signal counts as the second.
     first_s = math.inf if not ending else time.monotonic() if signals.came else -math.inf
 
     def come(number: int, frame: object) -> None:

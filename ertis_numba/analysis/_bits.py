@@ -29,10 +29,7 @@ _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder=
 
 
 class Shares(NamedTuple):
-    """Bit statistics (bit,) of eight channels: shares of ones, of changes, and of samples where 17 equal bits start.
-
-    ``repeats`` is True if the whole record repeats a pattern of 2 to 32 samples.
-    """
+    """Bit statistics (bit,) of eight channels: shares of ones, of changes, and of samples where 17 equal bits start."""
 
     ones: NDArray[np.float64]
     changes: NDArray[np.float64]
@@ -72,13 +69,8 @@ def _ones(column: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDArray[np.float32]:
-    """Return the power of a signal over time and frequency, from frequency 0 on: (segment, line).
-
-    The result holds periodograms of half-overlapping segments under a Hann window (P. D. Welch, The use of fast Fourier
-    transform for the estimation of power spectra, IEEE Trans. Audio Electroacoust. 15, 1967). The sum over all
-    ``size / 2`` lines of white noise is its mean square, full scale 1. scipy.signal has an equivalent function, but its
-    import takes longer than all computations here.
-    """
+    """Return the power of a signal over time and frequency, from frequency 0 on: (segment, line)."""
+    # Half-overlapping segments under a Hann window (P. D. Welch, 1967), as scipy.signal has, whose import takes longer.
     segments = sliding_window_view(signal, size)[:: size // 2]
     window = np.hanning(size + 1)[:-1].astype(np.float32)
     lines = scipy.fft.rfft(segments * window)[:, :n_lines]

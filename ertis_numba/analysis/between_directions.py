@@ -27,11 +27,7 @@ _BEHIND: Final = 0.1  # Triangles nearer to the centre of the sphere close its o
 
 
 class Between:
-    """Places (place, axis) between directions, or for a spatial grid with a name, within its limits.
-
-    A single direction has none. With ``is_planar``, all directions lie on a circle, and the places in the middle
-    between neighbours.
-    """
+    """Places (place, axis) between directions, or for a spatial grid with a name, within its limits."""
 
     def __init__(self, directions: Floats, processing: Processing) -> None:
         limits = _limits_rad(processing, len(directions))

@@ -93,10 +93,7 @@ SILENT: Final = CallMatch("unknown", note="the record contains no sweep above th
 
 
 def first_call_match(measurements: Iterable[Measurement], *, best: bool = False) -> CallMatch:
-    """Return the first known match among 8 measurements; otherwise the first unknown one with sound.
-
-    With ``best``, a later match is preferred to a mismatch, because another sonar may be louder at times.
-    """
+    """Return the first known match among 8 measurements; otherwise the first unknown one with sound."""
     every = []
     for measurement in itertools.islice(measurements, _MAX_MEASUREMENTS):
         every.append(call_match(measurement))
@@ -107,13 +104,9 @@ def first_call_match(measurements: Iterable[Measurement], *, best: bool = False)
 
 
 def call_match(measurement: Measurement) -> CallMatch:
-    """Compare the call with the sweep that the strongest sound contains, over the whole band of the record.
-
-    If the call's filter compresses part of the sound, and no similar sweep compresses that part better, the call
-    matches, because another sensor may be louder. Its emission must begin at the first frequency of the call, because
-    ranges are wrong otherwise. The verdict is ``unknown`` if the sound is not above the noise or not a sweep, or hides
-    its first frequency.
-    """
+    """Compare the call with the sweep that the strongest sound contains, over the whole band of the record."""
+    # The call matches if its filter compresses part of the sound, no similar sweep does so better, and the emission
+    # begins at its first frequency. Another sensor may be louder.
     call = measurement.settings.call
     signals, rate_hz = some_signals(measurement, _MAX_MICS)
     low_hz = min(sub_band_hz(rate_hz) / 2, call.low_frequency_hz / WIDER)

@@ -97,10 +97,7 @@ def _times_s(call: Call) -> NDArray[np.float64]:
 
 
 def _density(sound: SoundSpectra, curve: Curve, call: Call) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of the strongest arrival at times since the start of the call, and the background.
-
-    A sweep spends the time in a band that its curve states, so that the sum over the band is that over this time.
-    """
+    """Return the power of the strongest arrival at times since the start of the call, and the background."""
     low_hz, high_hz = call.low_frequency_hz, call.high_frequency_hz
     arrival = arrival_of(sound, curve, low_hz / WIDER, high_hz * WIDER, gate_s=_GATE_S, whole_hz=(low_hz, high_hz))
     at_s = curve.delay_s(arrival.frequency_hz) - curve.delay_s(call.start_frequency_hz)

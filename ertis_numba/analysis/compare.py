@@ -79,10 +79,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """Numbers and errors of reflectors over several images; errors of the matched ones are None if there are none.
-
-    The bias is positive if peaks are too far away. The error of the angle is None if no array observes a direction.
-    """
+    """Numbers and errors of reflectors over several images; None if none matched. A positive bias is too far away."""
 
     measurements: int
     angle_rms_deg: float | None
@@ -184,11 +181,7 @@ def _place(peak: Peak) -> tuple[float, float, float]:
 
 
 def visible(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:
-    """Return True for each reflector (reflector,) that an image can show, whatever its level.
-
-    It returns the sensor's own call, its range lies on the range axis, and its direction within half a main lobe of the
-    nearest direction of the image.
-    """
+    """Return True for each reflector (reflector,) that an image can show, whatever its level."""
     return _in_range(image, reflectors) & _is_own(reflectors) & _in_view(image, reflectors, _lobe_of(image.settings))
 
 
@@ -306,11 +299,7 @@ def _explained(
     counts: NDArray[np.bool_],
     step_db: float,
 ) -> NDArray[np.bool_]:
-    """Return True for each peak (peak,) caused by a reflector that need not be found there.
-
-    Such peaks belong to reflectors that do not count, or to mirror images behind the array. They may also be side lobes
-    of reflectors outside the solid angle, which `find_peaks` cannot predict.
-    """
+    """Return True for each peak (peak,) caused by a reflector that need not be found there."""
     if not peaks or not reflectors:
         return np.zeros(len(peaks), dtype=np.bool_)
     offsets = _units(reflectors)[:, None] - _units(peaks)[None]

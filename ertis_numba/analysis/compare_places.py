@@ -25,11 +25,9 @@ _MIN_DB: Final = -1000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceErrors:
-    """Errors of points or occupied cells relative to a scene, over SYNC pulses.
+    """Errors of points or occupied cells relative to a scene, over SYNC pulses."""
 
-    ``spurious`` are away from all reflectors and surfaces; the fusion has confirmed ``spurious_confirmed`` points.
-    ``error_cm`` is the RMS distance between reflectors and their points, or between cells and the nearest surface.
-    """
+    # `error_cm` is the RMS distance between reflectors and their points, or between cells and the nearest surface.
 
     pulses: int
     matched: int
@@ -59,12 +57,9 @@ def compare_points(
     is_planar: bool,
     min_level_db: float = -30.0,
 ) -> Places:
-    """Compare the points of a fused pulse with the ground truth in the same frame.
-
-    Points and reflectors are assigned one to one within 10 cm, as many as possible, and then with the least sum of
-    squared distances. A point is spurious if it is more than 10 cm away from all reflectors and surfaces. Planar images
-    show the distance of a reflector, but not its height. Reflectors below ``min_level_db`` do not count.
-    """
+    """Compare the points of a fused pulse with the ground truth in the same frame."""
+    # They are assigned one to one within 10 cm, with the least sum of squares. Points farther from everything are
+    # spurious.
     counts = _counted(reflectors, min_level_db)
     place_m, true_m = points.position_m.astype(np.float64), positions_m(reflectors)
     if is_planar:
@@ -85,9 +80,7 @@ def compare_map(
 ) -> Places:
     """Compare an occupancy map with the ground truth in the same frame; `joined` merges reflectors of several pulses.
 
-    A reflector is found if the centre of an occupied cell is at most 5 cm and half a cell away from it. A cell is
-    spurious if its centre is farther than this from all reflectors and surfaces. Heights do not count in a map of two
-    dimensions, and neither do floors and ceilings.
+    A reflector is found, and a cell is not spurious, within 5 cm and half a cell. Planes ignore heights.
     """
     gate_m = _OUTSIDE_M + occupancy.cell_m / 2
     counts = _counted(reflectors, min_level_db)

@@ -200,10 +200,7 @@ def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], no
 def left_out_at_edges(
     image: Energyscape, peaks: Sequence[Peak], *, min_level_db: float = -30.0, false_alarm: float | None = None
 ) -> int:
-    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them.
-
-    ``peaks`` are those of `find_peaks` with the same arguments; their side lobes do not count.
-    """
+    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them."""
     if image.points is not None:
         return 0
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
@@ -219,10 +216,7 @@ def left_out_at_edges(
 
 
 def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_alarm: float) -> int:
-    """Return the number of maxima that `find_peaks` left out as possible noise from their direction.
-
-    Side lobes of listed reflectors and of these maxima do not count.
-    """
+    """Return the number of maxima that `find_peaks` left out as possible noise from their direction."""
     if image.points is not None:
         return 0
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
@@ -284,8 +278,7 @@ def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:
 def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return each direction with its two nearest neighbours at one elevation, otherwise eight: (direction, neighbour).
 
-    Equal directions, such as azimuths of -180° and 180°, count as one neighbour, and are added to each other's rows in
-    further columns. Column 0 is the direction, or the first one equal to it.
+    Equal directions, such as azimuths of ±180°, share their neighbours in further columns.
     """
     count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
     # Adding 0 turns -0 into 0.
@@ -308,11 +301,7 @@ def _local_maxima(
     floor: NDArray[np.float64],
     where: NDArray[np.bool_] | None,
 ) -> NDArray[np.int64]:
-    """Return the local maxima that reach ``floor`` (range,): (peak, [direction, range]).
-
-    The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of the
-    image.
-    """
+    """Return the local maxima that reach ``floor`` (range,): (peak, [direction, range])."""
     inner = slice(1, -1) if amplitude.shape[1] > 2 else slice(None)
     start = inner.start or 0
     here = amplitude[:, inner]

@@ -42,11 +42,7 @@ _LEAST: Final = 1e-9
 
 
 class Lobe(NamedTuple):
-    """Main lobe of an array at one frequency, or of a call, for one method.
-
-    ``response`` is that of delay-and-sum, from which ``peak`` returns the amplitudes of the method; a source between
-    directions may lose ``max_loss_db``.
-    """
+    """Main lobe of an array at one frequency, or of a call, for one method."""
 
     response: Response
     peak: Peak
@@ -246,10 +242,7 @@ def image_peak(settings: Settings) -> Peak:
 
 
 def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
-    """Return a warning, with a grid that suffices, if a reflector between directions may lose half of its power.
-
-    Grids of a single direction and arrays that observe no direction have none.
-    """
+    """Return a warning, with a grid that suffices, if a reflector between directions may lose half of its power."""
     if not any(observable_angles(settings.array)[:2]):
         return None
     lobe = Lobe(CallResponse(settings), image_peak(settings))

@@ -22,14 +22,9 @@ _LEAST: Final = 16  # Ranges from which the noise of a direction is estimated at
 def stands_out(
     image: Energyscape, row: NDArray[np.int64], column: NDArray[np.int64], false_alarm: float, n_pulse: int
 ) -> NDArray[np.bool_]:
-    """Return True for maxima (maximum,) that noise from their direction does not explain.
-
-    They are as short in range as the pulse of the call. They also exceed the noise of the same direction, over the
-    whole record and within the length of the call, to which the matched filter spreads clicks. In cleaned images, the
-    noise is unknown, and all maxima stand out. Weak echoes do not stand out among many stronger ones of the same
-    direction. A click yields a maximum that stands out in about one of 40 images. ``false_alarm`` is the approximate
-    probability anywhere in the image.
-    """
+    """Return True for maxima (maximum,) that noise from their direction does not explain."""
+    # They exceed the noise of their direction, in the whole record and within the length of the call, and are as short
+    # in range as its pulse. The noise of cleaned images is unknown: all of their maxima stand out.
     if not len(row) or len(image.range_m) < _LEAST or image.settings.processing.is_cleaned:
         return np.ones(len(row), np.bool_)
     top = image.amplitude[row, column]

@@ -79,13 +79,9 @@ class EchoFits:
         noise: float,
         model: float,
     ) -> Fitted:
-        """Return the echoes that fit samples (place, sample) best.
-
-        The second sample is the maximum, the first and third ones are those beside it in range, and its neighbours
-        follow. ``place`` (place,) is that of its direction among the wanted ones. ``tops`` (place, 5): shift in range
-        steps, offset of the direction, and logarithm of the amplitude. ``noise`` is the RMS of the image, 0 if unknown,
-        and ``model`` the plan's error relative to the amplitude.
-        """
+        """Return the echoes that fit samples (place, sample) best."""
+        # Samples are the maximum, those before and after it in range, and its neighbours. `tops` (place, 5) are the
+        # shift in range steps, the offset of the direction, and the logarithm of the amplitude.
         amplitude = image.amplitude[rows, columns].astype(np.float64)
         is_used = amplitude > 0
         is_used[:, 3:] &= self._is_other[place]

@@ -34,11 +34,8 @@ def emission_time_s(measurement: Measurement) -> float | None:
 
 
 def emissions_of(measurement: Measurement) -> EmissionTimes | None:
-    """Return the emissions whose direct sound the first 0.1 s of a record contain.
-
-    The emitter is at the array's centre. The result is None if the strongest arrival may be an echo, and for arrays
-    such as rings, at which direct sound equals an echo from ahead. Saturated direct sound has a result, too.
-    """
+    """Return the emissions whose direct sound the first 0.1 s of a record contain."""
+    # None if it may be an echo, and for arrays such as rings, at which direct sound equals an echo from ahead.
     settings = measurement.settings
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     positions_m = layout.enabled_positions_m
@@ -76,10 +73,7 @@ def emissions_of(measurement: Measurement) -> EmissionTimes | None:
 def describe_start(
     emissions: Iterable[EmissionTimes | None], speed_m_s: float, *, delay_s: float = 0.0
 ) -> tuple[str, str] | None:
-    """Return a text about records that do not begin with their only emission, and a remedy; None if all do.
-
-    The direct sound is not compared unless that of most records is clear. The remedy names ``call.delay_s``.
-    """
+    """Return a text about records that do not begin with their only emission, and a remedy; None if all do."""
     every = list(emissions)
     known = [each for each in every if each is not None]
     if 2 * len(known) <= len(every):

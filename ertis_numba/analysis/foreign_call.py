@@ -1,8 +1,4 @@
-"""Search for the call of another sensor beside the own one, whose echoes are ghosts.
-
-The matched filter of the own call compresses its echoes to short peaks, and spreads another sweep over a part of a
-millisecond or more. Without these peaks, the search for a sweep finds the other one.
-"""
+"""Search for the call of another sensor beside the own one, whose echoes are ghosts."""
 
 from dataclasses import replace
 from typing import Final

@@ -54,11 +54,8 @@ class EchoFloor(NamedTuple):
         place: NDArray[np.intp],
         *quantiles: float,
     ) -> NDArray[np.float32]:
-        """Return thresholds (quantile, bin) of some bins of the image, also for clicks from their direction.
-
-        Their noise is estimated from a quantile of the amplitudes around a bin. Higher ones than the median follow
-        noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
-        """
+        """Return thresholds (quantile, bin) of some bins of the image, also for clicks from their direction."""
+        # Their noise is a quantile of the amplitudes around a bin, without the slopes of its own echo.
         first = np.array([1 - self.n_around, -self.n_around // 2, 0])  # A click may begin or end at the bin.
         clicks = np.empty((len(quantiles), len(place)), np.float32)
         given = np.ascontiguousarray(amplitude), direction, place, first, self.n_around, np.array(quantiles)
@@ -70,11 +67,8 @@ class EchoFloor(NamedTuple):
 
 
 def noise_of(image: Energyscape) -> float:
-    """Return the root mean square of the noise of an image; 0 if it is unknown.
-
-    The result is the lower tercile of estimates from the medians of blocks of ranges. The noise of beamformers other
-    than delay-and-sum is unknown, because it is not Rayleigh-distributed. That of cleaned images is unknown, too.
-    """
+    """Return the root mean square of the noise of an image; 0 if it is unknown."""
+    # The lower tercile of estimates from medians of blocks; unknown if not Rayleigh-distributed, as in cleaned images.
     processing = image.settings.processing
     if processing.is_adaptive or processing.is_cleaned or not image.amplitude.size:
         return 0.0
@@ -84,10 +78,8 @@ def noise_of(image: Energyscape) -> float:
 
 
 def medians_of(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the median of each row; NaN for rows with NaN.
-
-    `numpy.median` takes nine times as long, because it partitions at several places, without vector instructions.
-    """
+    """Return the median of each row; NaN for rows with NaN."""
+    # Nine times as fast as `numpy.median`, which partitions at several places without vector instructions.
     return _medians_in_place(rows.copy())
 
 
@@ -118,12 +110,8 @@ def _medians_of_blocks(amplitude: NDArray[np.float32], n_blocks: int) -> NDArray
 
 
 def threshold_of(image: Energyscape, false_alarm: float | None) -> float:
-    """Return the amplitude that noise reaches anywhere in an image with a probability; 0 if either is unknown.
-
-    A bin of noise with root mean square s exceeds t with the probability ``exp(-t²/s²)``. The function treats all bins
-    as independent, so the threshold is slightly too high. For one-bit microphones, it is at least -140 dB of full
-    scale, because bits that never change leave only rounding errors. ``false_alarm`` is 1e-12 to 1.
-    """
+    """Return the amplitude that noise reaches anywhere in an image with a probability; 0 if either is unknown."""
+    # A bin exceeds t with the probability `exp(-t²/s²)`, and all bins count as independent. PDM: at least -140 dBFS.
     if false_alarm is None:
         return 0.0
     checks.between("false_alarm", false_alarm, 1e-12, 1.0)
@@ -132,13 +120,8 @@ def threshold_of(image: Energyscape, false_alarm: float | None) -> float:
 
 
 def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
-    """Return the amplitude that noise reaches anywhere in an image with the approximate probability ``false_alarm``.
-
-    Unlike `threshold_of`, it follows noise that differs between directions, such as that of a machine, or between
-    ranges, such as a click, which the matched filter spreads over the length of the call. It holds for all beamformers
-    and for cleaned images. The amplitude of others is about a power of that of delay-and-sum. Cleaned images keep the
-    strongest direction of each range, which has the distribution of a single one at the worst.
-    """
+    """Return the amplitude that noise reaches anywhere in an image with the approximate probability ``false_alarm``."""
+    # Unlike `threshold_of`, it follows noise that differs between directions and between ranges, for all beamformers.
     settings, amplitude = image.settings, image.amplitude
     n_directions, n_ranges = amplitude.shape
     exponent = _exponent(settings.processing)
@@ -186,10 +169,6 @@ def _quiet(medians: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _exponent(processing: Processing) -> float:
-    """Return the power of the amplitude of delay-and-sum that the amplitude of noise is proportional to, about.
-
-    The coherence factor multiplies it by its square, relative to the power of all microphones. That of ``capon`` also
-    holds for noise of a narrow band.
-    """
+    """Return the power of the amplitude of delay-and-sum that the amplitude of noise is proportional to, about."""
     own = {"dmas": float(processing.dmas_order), "capon": _CAPON}.get(processing.beamformer, 1.0)
     return own + (2.0 if processing.weighting == "coherence_factor" else 0.0)

@@ -25,11 +25,7 @@ def has_outside(settings: Settings, directions: NDArray[np.float64]) -> bool:
 
 
 def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: float) -> OutsideSource | None:
-    """Return the reflector outside of a grid that explains an image around a range; None if one inside may.
-
-    The microphones receive an echo at ranges that differ by up to the radius of the array. The powers at all of them
-    add up to the sum of the powers at the frequencies of the call.
-    """
+    """Return the reflector outside of a grid that explains an image around a range; None if one inside may."""
     patterns = _patterns(image.settings, directions.tobytes())
     if patterns is None:
         return None

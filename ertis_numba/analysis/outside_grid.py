@@ -1,8 +1,6 @@
 """Sound from directions that a grid does not contain, found by the pattern of its side lobes.
 
-The powers of a single source over a grid are the pattern of its beam. Side lobes of a source beyond the limits of a
-grid form maxima within it, at wrong directions. The pattern over the grid then fits a source outside clearly better
-than any inside.
+The powers of a single source over a grid are the pattern of its beam, which fits a source outside clearly better.
 """
 
 import math
@@ -37,11 +35,7 @@ class OutsideSource(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutsidePatterns:
-    """Beam patterns (source, sample) of sources inside and outside of a grid, with a mean of 0 and a norm of 1.
-
-    ``samples`` are the compared directions of the grid, ``places`` (source, axis) the sources outside, and ``norms``
-    (source,) those of their patterns.
-    """
+    """Beam patterns (source, sample) of sources inside and outside of a grid, with a mean of 0 and a norm of 1."""
 
     samples: NDArray[np.int64]
     places: Floats
@@ -57,11 +51,7 @@ class OutsidePatterns:
         frequency_hz: Floats,
         weights: Floats | None = None,
     ) -> "OutsidePatterns | None":
-        """Return the patterns of an array, whose powers add up over frequencies, or None if there are none to compare.
-
-        This is so if the grid contains all directions that the array distinguishes, if it has fewer than eight
-        directions, or if the beams of the array are too narrow (`_MAX_PLACES`).
-        """
+        """Return the patterns of an array, whose powers add up over frequencies; None if there are none to compare."""
         if len(directions) < _MIN_DIRECTIONS:
             return None
         highest_hz = float(frequency_hz.max())

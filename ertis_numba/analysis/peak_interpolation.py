@@ -46,15 +46,10 @@ def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.flo
 
 
 class PeakInterpolator:
-    """Interpolator of maxima between the bins of an image, prepared for all directions or for ``only`` some.
+    """Interpolator of maxima between the bins of an image, prepared for all directions or for ``only`` some."""
 
-    Parabolas through the logarithm of the amplitude locate a maximum. A main lobe is not a parabola, and a coarse grid
-    has no bins within it. For delay-and-sum of the fast method, the image of a single reflector is therefore fitted to
-    the bins: see `ertis_numba.analysis.echo_fits.EchoFits`. The fit includes the curvature of spherical waves that
-    beams for plane waves do not expect.
-    A maximum never leaves the cell of its direction, which ends half-way to each neighbour. It exceeds its bin by at
-    most the loss of the main lobe over this distance. Lists of maxima also limit it by `listed`.
-    """
+    # Parabolas through logarithms locate a maximum, or `EchoFits` for delay-and-sum of the fast method. A maximum never
+    # leaves the cell of its direction, which ends half-way to each neighbour.
 
     def __init__(
         self,

@@ -120,10 +120,7 @@ class PointSpread:
         return 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
 
     def tilts(self, range_m: Floats, air: Air | None) -> tuple[Floats, Floats]:
-        """Return the tilts of the spectra of echoes relative to the pulse in 1/Hz, and their amplitudes: (place,).
-
-        Air absorbs high frequencies more. The tilts are lines over frequency that fit the spectra best.
-        """
+        """Return the tilts of the spectra of echoes relative to the pulse in 1/Hz, and their amplitudes: (place,)."""
         frequency_hz, shares = self.spectrum
         offset_hz = frequency_hz - self._carrier_1_m * self._speed_m_s / (2 * math.pi)
         mean_hz, air, known = float(shares @ offset_hz), air or self._air, self._absorbed

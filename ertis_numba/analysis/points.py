@@ -144,11 +144,7 @@ class PointExtractor:
         return np.asarray(is_open | (is_near & is_stronger & is_open).any(axis=1))
 
     def _maxima(self, image: Energyscape) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the direction and range indices of all maxima.
-
-        The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of
-        the image.
-        """
+        """Return the direction and range indices of all maxima."""
         amplitude, n_ranges = image.amplitude, len(image.range_m)
         none = np.empty(0, dtype=np.int64)
         profile = amplitude.max(axis=0)
@@ -186,11 +182,8 @@ class PointExtractor:
 
 
 class EchoPointExtractor(PointExtractor):
-    """Extractor for fusion and odometry, whose uncertainties are those of noise only.
+    """Extractor for fusion and odometry, whose uncertainties are those of noise only."""
 
-    Both model the interference of echoes themselves. With the misfit to a single echo as well, they would accept echoes
-    of other reflectors as those of one. Both also compare all maxima with the noise. Images of one elevation are those
-    of reflectors at this elevation.
-    """
+    # With the misfit to a single echo as well, both would accept echoes of other reflectors as those of one.
 
     _noise_only = True

@@ -34,12 +34,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuadricFits:
-    """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them.
+    """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them."""
 
-    A plane needs neighbours all around. Otherwise, as at the edge of a grid, a parabola through two opposite neighbours
-    remains, and no fit at all if there are none, as in a corner. ``width_rad`` (direction,) is the distance of the
-    nearest other direction, infinite for none. The cell of a direction ends half-way to each of the others in ``grid``.
-    """
+    # Without neighbours all around, a parabola through two opposite ones remains, or no fit. A cell ends half-way to
+    # each other direction of `grid`.
 
     quadrics: kernels.Quadrics
     width_rad: Floats
@@ -78,11 +76,9 @@ class QuadricFits:
         )
 
     def tops(self, directions: NDArray[np.int64], rises: Floats) -> tuple[Floats, Floats]:
-        """Return offsets (place, axis) from directions to the maxima of their quadrics, and the rise there.
-
-        An offset is 0 if there is no maximum within the distance of the farthest neighbour. It may lie outside of the
-        cell: see `within_cells`. ``rises`` are the values at the neighbours minus that at the direction.
-        """
+        """Return offsets (place, axis) from directions to the maxima of their quadrics, and the rise there."""
+        # Offsets are 0 without a maximum within the distance of the farthest neighbour. `rises` are values minus that
+        # here.
         found = np.empty((len(rises), 4))
         kernels.load_points().find_tops(self.quadrics, directions, np.ascontiguousarray(rises, np.float64), found)
         return found[:, :3], found[:, 3]
@@ -90,11 +86,8 @@ class QuadricFits:
     def within_cells(
         self, directions: NDArray[np.int64], offset: Floats, *, is_fitted: bool = False
     ) -> tuple[Floats, Floats]:
-        """Return offsets shortened to end within their cells, (place, axis), and the width of cells: (place,).
-
-        A width is 0 if the direction is interpolated along as many axes as the grid has, and less than that
-        of the cell if the offset was shortened a little. With ``is_fitted``, also beside an edge of the grid.
-        """
+        """Return offsets shortened to end within their cells, (place, axis), and the width of cells: (place,)."""
+        # The width is 0 for directions that are interpolated along all axes of the grid.
         share, width_rad = np.ones(len(offset)), self.width_rad[directions]
         far = np.flatnonzero(np.linalg.norm(offset, axis=1) > _INNER * width_rad)  # Others cross no border.
         here, moved, part = self.grid.data[self.wanted[directions[far]]], offset[far], np.ones(len(far))
@@ -130,11 +123,7 @@ class QuadricFits:
     def are_open(
         self, directions: NDArray[np.int64], neighbours: NDArray[np.int64], rises: Floats | None = None
     ) -> NDArray[np.bool_]:
-        """Return True at edges of the grid where the maximum may lie beyond the cell of the direction: (place,).
-
-        Values on one side of a direction show a maximum in its cell only if a quadric through them has it there. If
-        ``rises``, the values at the neighbours minus that of the direction, are unknown, all edges are open.
-        """
+        """Return True at edges of the grid where the maximum may lie beyond the cell of the direction: (place,)."""
         is_open = np.zeros(len(directions), dtype=np.bool_)
         for place in np.flatnonzero(self.quadrics.n_axes[directions] < self.n_axes_of_grid):
             row = directions[place]

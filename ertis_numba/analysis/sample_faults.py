@@ -40,10 +40,7 @@ _FEW: Final = 64  # Samples that are compared first.
 
 
 def dropouts(measurement: Measurement, settings: Settings | None = None) -> Parts:
-    """Return the parts (first, stop) of a measurement that are dropouts, without zeros at either end.
-
-    Recorders with a trigger write zeros there.
-    """
+    """Return the parts (first, stop) of a measurement that are dropouts, without zeros at either end."""
     settings = settings or measurement.settings
     rows = sample_format(settings).validated(measurement.data, any_length=True)
     enabled = np.flatnonzero(microphones(settings.array).enabled)
@@ -57,11 +54,8 @@ def dropouts(measurement: Measurement, settings: Settings | None = None) -> Part
 
 
 def constant_parts(rows: NDArray[Any], enabled: NDArray[np.intp], *, is_pdm: bool) -> Parts:
-    """Return the parts (first, stop) of a record, (sample, word), in which no enabled channel changes.
-
-    Such a part is longer than chance permits, and begins and ends within noise or sound: a record without noise is
-    constant between its echoes, which rise and decay gradually. All channels of a part at their extremes are saturated.
-    """
+    """Return the parts (first, stop) of a record, (sample, word), in which no enabled channel changes."""
+    # A part begins and ends within noise or sound, because records without noise are constant between echoes.
     shortest = MIN_DROPOUT_WORDS if is_pdm else MIN_DROPOUT_NUMBERS
     stride = shortest // 2
     kept = _enabled_bits(rows, enabled) if is_pdm else rows

@@ -131,11 +131,7 @@ class SideLobes:
         return min(1.0, max(0.0, (apart / scale - low) / (high - low))) if scale > 0 else 0.0
 
     def _doubt_of(self, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> float:
-        """Return the uncertainty of the side-lobe pattern, from 0 to 1, at the reflector whose pattern fits best.
-
-        Only the strongest maxima of separate ranges are compared, because one of them may be the only reflector at its
-        range. Adaptive beamformers have weaker side lobes than predicted, so their uncertainty is 0.
-        """
+        """Return the uncertainty of the side-lobe pattern, from 0 to 1, at the reflector whose pattern fits best."""
         if self._image.settings.processing.is_adaptive:
             return 0.0
         ratios: list[float] = []
@@ -232,10 +228,7 @@ class EdgeFloor:
 
 
 class _Skirt(NamedTuple):
-    """Pulse of an echo beyond an edge of an image, whose ranges are (range,) ``inwards``.
-
-    ``share`` is that of its amplitude at the range ``last`` or before, which no reflector within the image exceeds.
-    """
+    """Pulse of an echo beyond an edge of an image, whose ranges are (range,) ``inwards``."""
 
     inwards: slice
     is_open: NDArray[np.bool_]
@@ -272,13 +265,9 @@ def _upper_quartile(values: NDArray[np.float32]) -> NDArray[np.float32]:
 def side_lobe_floor(
     highest: NDArray[np.float32], range_m: NDArray[np.float64], noise: float = 0.0
 ) -> NDArray[np.float32]:
-    """Return the amplitude (range,) below which side lobes are expected, coarser than `SideLobes`, but fast.
-
-    The limit lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse length. ``highest``
-    (range,) are the maxima over all directions at evenly spaced ranges. ``noise`` is the amplitude that noise alone
-    hardly reaches; its power adds to that of side lobes, because few side lobes are near the limit. The strongest
-    amplitude itself is no side lobe.
-    """
+    """Return the amplitude (range,) below which side lobes are expected, coarser than `SideLobes`, but fast."""
+    # It lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse; the power of `noise` adds to
+    # it.
     reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
     around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")
     floor = np.hypot(around * np.float32(10 ** (-SIDE_LOBE_DB / 20)), np.float32(noise))
@@ -286,11 +275,7 @@ def side_lobe_floor(
 
 
 def without_side_lobes(image: Energyscape) -> Energyscape:
-    """Return a copy of an image in which amplitudes below `side_lobe_floor` are much weaker, for pictures.
-
-    A level of 1 dB below the limit becomes 15 dB. Main lobes therefore fade at their rims. Amplitudes of 0 would cut
-    them along the borders of the directions.
-    """
+    """Return a copy of an image in which amplitudes below `side_lobe_floor` are much weaker, for pictures."""
     if len(image.range_m) < 2:
         return image
     floor = side_lobe_floor(image.amplitude.max(axis=0, initial=0.0), image.range_m)

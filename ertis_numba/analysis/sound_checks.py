@@ -23,14 +23,10 @@ class SoundMismatch(NamedTuple):
 
 
 class SoundChecks:
-    """Checks of the measurements of one sensor, each of which reports at most one mismatch.
+    """Checks of the measurements of one sensor, each of which reports at most one mismatch."""
 
-    Call and layout are compared until they are known, in at most 8 measurements. A note is reported once while the call
-    is unknown. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so on,
-    or in all if not ``thinned`` because the caller skips some. Another call ends all checks, because its filter does
-    not find the times of arrival. Dropouts are reported once, and so are copies of measurements if ``live``: a program
-    may process one measurement several times.
-    """
+    # Call and layout are compared in at most 8 measurements, until known; the start of the record in numbers 1, 2, 4, 8
+    # and so on if `thinned`. Another call ends all checks.
 
     def __init__(self, *, thinned: bool = True, live: bool = False) -> None:
         self._thinned, self._count = thinned, 0

@@ -49,11 +49,9 @@ _EDGE: Final = 0.1  # Power at the edges of a band relative to its middle.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatedArrival:
-    """Sound around the strongest arrival of each microphone after a curve's filter, with its power ``peak`` (mic,).
+    """Sound around the strongest arrival of each microphone after a curve's filter, with its power ``peak`` (mic,)."""
 
-    ``elsewhere`` (bin,) is the median power spectrum of equally long parts of the record, averaged over microphones,
-    and ``noise`` (bin,) the magnitude by which the spectra were divided.
-    """
+    # `elsewhere` (bin,) is the median power spectrum of other parts; `noise` (bin,) has divided the spectra.
 
     spectra: NDArray[np.complex128]
     frequency_hz: NDArray[np.float64]
@@ -197,11 +195,7 @@ def arrival_of(
     gate_s: float = _GATE_S,
     whole_hz: Sequence[float] = (),
 ) -> GatedArrival:
-    """Return the strongest arrival of each microphone after the filter of a curve in a band.
-
-    With ``whole_hz``, the record contains these frequencies of the arrival, which neither began before the record nor
-    ends after it.
-    """
+    """Return the strongest arrival of each microphone after the filter of a curve in a band."""
     part = found.band(low_hz, high_hz)
     frequency_hz = found.frequency_hz[part]
     turned = found.bins[:, part] * np.exp(1j * curve.phase_rad(frequency_hz)).astype(np.complex64)
@@ -231,10 +225,7 @@ def arrival_of(
 
 
 def refined(arrival: GatedArrival, curve: Curve) -> tuple[Curve, float]:
-    """Return the curve of any modulation with the highest peak at an arrival, and the ratio of both peak powers.
-
-    Both powers are compared by microphone. Silent ones, such as dead channels, do not count.
-    """
+    """Return the curve of any modulation with the highest peak at an arrival, and the ratio of both peak powers."""
     at_hz = arrival.frequency_hz
     before_rad = curve.phase_rad(at_hz)
     n_fft = scipy.fft.next_fast_len(2 * len(at_hz))
@@ -269,10 +260,7 @@ def _peaks(arrival: GatedArrival, phases_rad: NDArray[np.float64], n_fft: int) -
 
 
 def sweep_along(found: SoundSpectra, curve: Curve, low_hz: float, high_hz: float) -> Sweep:
-    """Return the sweep that follows a curve through the strongest arrival, as far as it sounds in a band.
-
-    Its power at a frequency is relative to the time spent there.
-    """
+    """Return the sweep that follows a curve through the strongest arrival, as far as it sounds in a band."""
     arrival = arrival_of(found, curve, low_hz, high_hz)
     slopes_s_hz = np.abs(curve.slopes_s_hz(arrival.frequency_hz))
     is_sound = (arrival.power > arrival.background) & (arrival.power > _MIN_POWER * arrival.power.max())

@@ -19,10 +19,7 @@ _MAX_TONE_HZ: Final = 4e3  # Bandwidth of a pulse of a tone.
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Group delay of a sweep, whose frequency, its logarithm or its inverse is linear in time.
-
-    ``slope_s_hz`` is its derivative at the pivot, where the group delay and its phase are 0.
-    """
+    """Group delay of a sweep, whose frequency, its logarithm or its inverse is linear in time."""
 
     modulation: Modulation
     slope_s_hz: float

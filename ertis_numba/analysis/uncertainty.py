@@ -155,10 +155,7 @@ def _effective_covariance_m2(positions_m: NDArray[np.float64], weights: NDArray[
 
 
 def listed_echoes(spread: PointSpread, image: Energyscape, tops: Tops, noise: float) -> Floats:
-    """Return the amplitude of other points' images at each point, relative to its own: (point,) float64.
-
-    Side lobes of stronger points are no other echoes. They have the amplitude that is predicted for them.
-    """
+    """Return the amplitude of other points' images at each point, relative to its own: (point,) float64."""
     leak = _leak(spread, image, tops)
     echoes = np.zeros(len(leak))
     for point in np.argsort(-tops.amplitude, kind="stable"):
@@ -172,10 +169,7 @@ def listed_echoes(spread: PointSpread, image: Energyscape, tops: Tops, noise: fl
 
 
 def unlisted_echoes(spread: PointSpread, image: Energyscape, tops: Tops, noise: float) -> Floats:
-    """Return the amplitude of echoes within the slopes of points, relative to these: (point,) float64.
-
-    They are no maxima, but change the pulse along the range.
-    """
+    """Return the amplitude of echoes within the slopes of points, relative to these: (point,) float64."""
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     found, reach_m = np.zeros(len(tops.range_m)), spread.skirt_m
     if len(image.range_m) < 2:

@@ -97,8 +97,7 @@ def temporary_path(path: Path, token: str) -> Path:
 def atomic_write(path: Path, *, overwrite: bool = False, token: str | None = None) -> Iterator[Path]:
     """Yield a temporary name to write to; when the block succeeds, that file is synchronised and renamed to ``path``.
 
-    The name is unique by ``token``, or by random digits, and ends in ``.part``. If the block fails, the file is
-    removed. The checks of `check_target` run before the block and again before the file is renamed.
+    It ends in ``.part``, and is removed if the block fails. `check_target` runs before the block and before renaming.
     """
     check_target(path, overwrite=overwrite)
     part = temporary_path(path, token or secrets.token_hex(4))

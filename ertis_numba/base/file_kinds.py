@@ -30,11 +30,7 @@ _IMPORT = "import it with 'ertis import signals {file} --settings FILE.toml'"
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """Format of a file, with its article (``a WAV file``), and a remedy with ``{file}`` and ``{stem}``.
-
-    ``is_wav`` and ``is_hdf5`` mark formats that `open_pcm` reads, if their content fits; ``is_text`` marks lines of
-    text.
-    """
+    """Format of a file, with its article (``a WAV file``), and a remedy with ``{file}`` and ``{stem}``."""
 
     name: str
     remedy: str
@@ -184,10 +180,7 @@ def markup_of(text: str) -> str | None:
 
 
 def problem_of(path: str | Path, wanted: str = "a recording") -> str:
-    """Return the format of a file and its remedy, as ``is a FLAC file; convert it with …``; empty if unknown.
-
-    Signals can be converted into a recording. Otherwise, the remedy names the ``wanted`` file.
-    """
+    """Return the format of a file and its remedy, as ``is a FLAC file; convert it with …``; empty if unknown."""
     kind, path = kind_of(path), Path(path)
     if kind is None:
         return ""

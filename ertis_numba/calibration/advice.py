@@ -51,10 +51,7 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
 def not_observable(
     observed: NDArray[np.bool_], target: Target, expected: Tolerances, *, is_line: bool
 ) -> tuple[str, ...]:
-    """Return the quantities that no recording determines, one line each; observed is (mic, gain, delay, x, y, z).
-
-    Curved wavefronts reveal the scale only without errors of the model.
-    """
+    """Return the quantities that no recording determines, one line each; observed is (mic, gain, delay, x, y, z)."""
     lines = [
         "a common gain, delay or polarity of all microphones: their means are unchanged",
         "a rotation or shift of the whole array, or a mirrored layout if the place of no reflector is given",

@@ -187,10 +187,7 @@ def _fitted(job: PreparedFit) -> Calibration:
 
 
 def _overlapped(job: PreparedFit, few: dict[int, str]) -> dict[int, str]:
-    """Return the recordings whose echo another sound overlaps, with the reason, if enough others remain.
-
-    Such a sound, as from a floor, moves the times of neighbouring microphones together. Residuals do not show that.
-    """
+    """Return the recordings whose echo another sound overlaps, with the reason, if enough others remain."""
     other_s = [sound.arrival.other_sound[0] for sound in job.heard.sounds.values()]
     found = {
         index: f"another sound overlaps its echo: parts of the band differ by {1e6 * each_s:.1f} µs"

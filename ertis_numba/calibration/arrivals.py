@@ -105,11 +105,8 @@ def _between_halves(
     time_sd_s: NDArray[np.float64],
     level_sd: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Return standard deviations of times and relative levels because of other sound, such as other echoes.
-
-    Other sound moves the estimates of the lower and of the upper half of the band differently. Noise does the same, by
-    four times its variance in the whole band. A larger difference counts, and its share in the whole band is a quarter.
-    """
+    """Return standard deviations of times and relative levels because of other sound, such as other echoes."""
+    # Other sound moves the estimates of both halves of the band differently; noise does so by four times its variance.
     middle = len(turn) // 2
     amplitude = np.where(amplitude == 0, 1e-300, amplitude)  # of a channel that is constant
     late_s, level = [], []

@@ -47,13 +47,9 @@ def find_swaps(
     speed_m_s: NDArray[np.float64],
     target: Target,
 ) -> Permutation:
-    """Find microphones whose sounds arrive as they would at the positions of others; NaN times are left out.
-
-    The cost of microphone m at position j is the mean square over the recordings of its time minus the travel time to
-    j, without the constant part, which is a delay. The assignment of least total cost (H. W. Kuhn, The Hungarian method
-    for the assignment problem, 1955) is accepted only where the own position fits badly and another one much better, so
-    that errors of delays and positions are not taken for swaps.
-    """
+    """Find microphones whose sounds arrive as they would at the positions of others; NaN times are left out."""
+    # The assignment of least total squares (H. W. Kuhn, 1955) counts where the own position fits badly and another
+    # well.
     n_mics = len(positions_m)
     place = np.arange(n_mics)
     misfit_s = np.zeros(n_mics)

@@ -171,11 +171,8 @@ class PoseProblem:
 
 
 def fit_poses(problem: PoseProblem, *, max_steps: int = 30) -> PoseFit:
-    """Fit poses and reflectors by least squares with the loss soft_l1.
-
-    The covariance is the inverse of the Fisher information ``Jᵀ J`` with the reflectors eliminated, times the robust
-    mean square of the residuals (B. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
-    """
+    """Fit poses and reflectors by least squares with the loss soft_l1."""
+    # The covariance is `(JᵀJ)⁻¹` times the robust mean square of residuals (B. Triggs et al., 2000, section 6).
     found = scipy.optimize.least_squares(
         problem.residuals,
         problem.start(),

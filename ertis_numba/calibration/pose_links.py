@@ -78,12 +78,9 @@ def _emitter_points(waves: Sequence[Wave]) -> list[NDArray[np.float64]]:
 
 
 def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) -> list[RigidLink]:
-    """Return transforms from the second sensor to the first that many reflectors agree with, best first.
-
-    Echoes of one measurement in two sensors may be the same reflector. Three such pairs with equal distances yield a
-    transform (W. Kabsch, Acta Cryst. A 32, 1976, 922), and transforms that most pairs agree with are returned (M. A.
-    Fischler and R. C. Bolles, Comm. ACM 24, 1981, 381).
-    """
+    """Return transforms from the second sensor to the first that many reflectors agree with, best first."""
+    # Three pairs with equal distances yield a transform (W. Kabsch, 1976); agreement selects (Fischler and Bolles,
+    # 1981).
     pairs = _pairs(first, second)
     triples = _triples(pairs, np.random.default_rng(seed))
     if not len(triples):

@@ -63,11 +63,8 @@ def match_waves(
     speed_m_s: float,
     gates: Gates,
 ) -> Matched:
-    """Return the waves that reflectors and emitters explain; sensors are in the order of the SYNC chain.
-
-    Each echo of a sensor's own call suggests a reflector. The reflector that explains most waves of a measurement, as
-    echoes of all emitters, is accepted first. A reflector at rest counts once, because its errors do not average out.
-    """
+    """Return the waves that reflectors and emitters explain; sensors are in the order of the SYNC chain."""
+    # The reflector that explains most waves, as echoes of all emitters, is accepted first.
     poses = _Poses(rotation, translation_m, speed_m_s)
     sensors = list(waves.values())
     reflectors: list[_Reflector] = []

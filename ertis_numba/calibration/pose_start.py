@@ -31,11 +31,7 @@ class _Confirmed(NamedTuple):
 def place_sensors(
     waves: Mapping[str, WavesOfSensor], reference: str, speed_m_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotations and positions relative to the reference; raise DataError without enough reflectors.
-
-    A link between two sensors is confirmed by reflectors whose echoes of both calls arrive when they should. Sensors
-    are placed one after the other by the link with most such echoes to one that has its place.
-    """
+    """Return rotations and positions relative to the reference; raise DataError without enough reflectors."""
     links: dict[tuple[str, str], _Confirmed] = {}
     for first, second in combinations(waves, 2):
         confirmed = _confirmed({first: waves[first], second: waves[second]}, speed_m_s)

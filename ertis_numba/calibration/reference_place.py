@@ -135,11 +135,8 @@ def speed_from_spread(
     speed_m_s: float,
     target: Target,
 ) -> SoundSpeed:
-    """Return the speed of sound from the spread of the times (mic,) at which direct sound arrives.
-
-    Least squares with the emitter's position and the pace 1 / c as unknowns, and a normal prior of 5 % for the pace.
-    The uncertainty is the Cramér-Rao bound.
-    """
+    """Return the speed of sound from the spread of the times (mic,) at which direct sound arrives."""
+    # Least squares with the emitter's position and 1 / c as unknowns, with a normal prior of 5 % for 1 / c.
 
     def residuals(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
         model = travel_times(unknown[None, :3], positions_m, speed_m_s / (1 + unknown[3]), target)

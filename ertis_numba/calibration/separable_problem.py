@@ -83,11 +83,8 @@ class SeparableProblem:
         return Solution(own, MM * source_mm.reshape(-1, 3), np.where(self._precision_us > 0, rest_s, np.nan))
 
     def covariance(self, source_mm: NDArray[np.float64], factor: float) -> tuple[NDArray[np.float64], float]:
-        """Return the covariance (mic, quantity, mic, quantity) and the number of determined unknowns.
-
-        It follows from the blocks of the microphones and the Schur complement of the sources; factor is the variance of
-        the times relative to the expected one.
-        """
+        """Return the covariance (mic, quantity, mic, quantity) and the number of determined unknowns."""
+        # It follows from the Schur complement of the sources; `factor` is the variance relative to the expected one.
         projected, inverse, gain = self._projected(self._solved(source_mm), source_mm, factor)
         rows = projected.reshape(-1, 3 * self.n_records)
         of_sources = np.linalg.inv(rows.T @ rows + np.diag(self._source_prior**2))

@@ -61,10 +61,7 @@ class Sound:
 def hear(
     measurement: Measurement, channels: NDArray[np.intp], positions_m: NDArray[np.float64], target: Target
 ) -> Sound:
-    """Return the strongest sound; raise DataError if channels are saturated, or no single sound stands out.
-
-    Direct sound is searched at paths below 0.5 m, other sound at longer ones.
-    """
+    """Return the strongest sound; raise DataError if channels are saturated, or no single sound stands out."""
     settings = measurement.settings
     signals, _, _, loud, n_samples = _signals(measurement, channels)
     if len(loud) > _MAX_SATURATED * len(channels):

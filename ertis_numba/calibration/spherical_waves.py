@@ -29,10 +29,7 @@ def wave_lags(
 def wave_slopes(
     direction: NDArray[np.float64], curvature_1_m: float, positions_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the derivatives of path lengths by path, direction and curvature: (mic, parameter).
-
-    The direction counts as three independent numbers, so that a flat array does not observe the one across it.
-    """
+    """Return the derivatives of path lengths by path, direction and curvature: (mic, parameter)."""
     along_m, root = _root(direction, np.float64(curvature_1_m), positions_m)
     squared_m2 = np.sum(positions_m**2, axis=1)
     by_curvature = (squared_m2 - along_m**2) / (root * (root + 1 - curvature_1_m * along_m))
@@ -56,10 +53,7 @@ def fit_wave(
     *,
     n_rounds: int = 6,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a spherical wave to path lengths (mic,) by Gauss-Newton; return it, and weights (mic,) from 0 to 1.
-
-    The weights are those of Cauchy: residuals beyond scale_m lose weight. The parameters are those of `Wave`.
-    """
+    """Fit a spherical wave to path lengths (mic,) by Gauss-Newton; return it, and weights (mic,) from 0 to 1."""
     wave = np.array(start, dtype=np.float64)
     weight = np.ones(len(paths_m))
     for _ in range(n_rounds):

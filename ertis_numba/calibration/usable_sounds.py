@@ -147,10 +147,7 @@ def _sources(heard: Heard, every: Microphones, used: NDArray[np.bool_], target: 
 def ordered(
     heard: Heard, every: Microphones, used: NDArray[np.bool_], target: Target
 ) -> tuple[Microphones, NDArray[np.float64], str]:
-    """Return microphones in the order that fits, their sources, and the name of an unexpected order.
-
-    Recordings that no wavefront fits are removed.
-    """
+    """Return microphones in the order that fits, their sources, and the name of an unexpected order."""
 
     def typical(positions_m: NDArray[np.float64]) -> float:
         other = replace(every, positions_m=positions_m[every.channels])

@@ -57,12 +57,8 @@ class Wave(NamedTuple):
 
 
 def find_waves(measurement: Measurement) -> list[Wave]:
-    """Return the waves of one measurement, strongest first; raise DataError if too few microphones work.
-
-    The strongest peak of all envelopes starts a search over directions for the spherical wave whose envelopes add up
-    best. Phases relative to the mean of the aligned signals yield the times, and a robust fit yields the wave. The mean
-    pulse is subtracted, and the search goes on with the rest (Högbom, Astron. Astrophys. Suppl. 15, 1974, 417).
-    """
+    """Return the waves of one measurement, strongest first; raise DataError if too few microphones work."""
+    # The wave whose envelopes add up best is subtracted, and the search goes on with the rest (J. A. Högbom, 1974).
     record, receivers = wave_record(measurement)
     speed_m_s = sound_speed_m_s(measurement.settings.air)
     reach = round(1.0 / record.bandwidth_hz / record.step_s)

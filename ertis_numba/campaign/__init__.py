@@ -1,9 +1,6 @@
 """Campaigns: processing of many recordings to energyscapes or acoustic maps, on all cores or on a cluster.
 
-Each recording becomes one output file, complete or not at all. An interrupted campaign therefore continues at the next
-recording. Workers are independent processes: a crash affects only the recording in progress.
-
-Names are imported when they are first used, because a worker needs only the modules that run its tasks.
+Each recording becomes one output file, complete or not at all; a crash of a worker affects only one recording.
 """
 
 import lazy_loader

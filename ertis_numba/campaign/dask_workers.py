@@ -21,12 +21,9 @@ _REPORT_INTERVAL_S: Final = 0.5
 
 
 class DaskWorkerPool:
-    """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
+    """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker."""
 
-    The workers need the same versions of this package and its dependencies, and the files under the same paths. Dask
-    repeats the task of a lost worker elsewhere, a few times. Every program that reaches a scheduler can run code on its
-    workers: keep it in a trusted network, or use TLS with dask. `wait` raises NetworkError if the connection is lost.
-    """
+    # Workers need the same versions and paths of files. Anyone who reaches a scheduler can run code on its workers.
 
     def __init__(self, address: str) -> None:
         self._address = address

@@ -28,10 +28,7 @@ def examine(
     verify: bool,
     heard: Planner | None = None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the examination of a sensor's plan for JSON: ``plan`` with predictions, ``verified`` with the true error.
-
-    Raises DataError if the true error of the image of ``first`` exceeds the budget, after it is yielded.
-    """
+    """Yield the examination of a sensor's plan for JSON: ``plan`` with predictions, ``verified`` with the error."""
     settings = pipeline.settings
     if settings.processing.method == "paper":
         raise ArgumentError(

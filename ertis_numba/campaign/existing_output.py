@@ -51,11 +51,8 @@ def _digest(*parts: bytes) -> str:
 
 
 def inspect_output(target: Path, recording: RecordingReader, kind: ResultKind, dtype: str) -> dict[str, Any] | None:
-    """Return settings and axes by sensor of an existing output of a recording; None without a file.
-
-    ``differs`` is the reason why the file is not this output, or that it is damaged. It is empty if only the settings
-    can differ. If ``recording`` is True, the file must not be replaced.
-    """
+    """Return settings and axes by sensor of an existing output of a recording; None without a file."""
+    # `differs` is the reason why the file is not this output, or that it is damaged.
     if not target.exists():
         return None
     try:

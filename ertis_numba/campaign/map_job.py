@@ -155,12 +155,8 @@ def prepare_maps(
     settings: Mapping[str, Settings] | None = None,
     warn: _Warn = lambda _: None,
 ) -> Generator[MapJob]:
-    """Open a recording and check every sensor, so that errors are reported before any processing.
-
-    Options of images have no effect. ``warn`` is called with a line for each sensor that has faulty microphones, bands
-    of noise only or coarse directions, and after the processing of a sensor that emitted its call. Raises DataError if
-    microphones are faulty and ``options.strict`` is set.
-    """
+    """Open a recording and check every sensor, so that errors are reported before any processing."""
+    # Options of images have no effect. Raises DataError if microphones are faulty and `options.strict` is set.
     with ExitStack() as stack:
         if settings is None:
             options.without.require_known(sensor_names(path))

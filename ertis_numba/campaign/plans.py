@@ -10,11 +10,9 @@ __all__ = ["Plans"]
 
 
 class Plans:
-    """Plans by the kind of result and the settings, and the plans in progress.
+    """Plans by the kind of result and the settings, and the plans in progress."""
 
-    Without them, workers with different measured costs could choose different plans, and the files would depend on the
-    worker. Acoustic maps have nothing to plan, but their kernels are also compiled by one worker.
-    """
+    # Without them, workers with different measured costs could choose different plans.
 
     def __init__(self) -> None:
         self._found: dict[bytes, Accuracy | str] = {}
@@ -28,8 +26,7 @@ class Plans:
     def begin(self, settings: Settings) -> Literal["new", "known"] | None:
         """Register settings as being planned; return ``new`` or ``known`` for their kernels, None if they have to wait.
 
-        Settings that differ only in the air have the same kernels. Those with new kernels are planned one at a time,
-        because several processes that compile the same kernels could corrupt the cache.
+        New kernels are planned one at a time: processes that compile the same ones could corrupt the cache.
         """
         key, new = _key(settings), _kernels_key(settings) not in self._compiled
         if key in self._in_progress or (new and any(self._in_progress.values())):

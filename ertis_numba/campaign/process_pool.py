@@ -26,10 +26,7 @@ class _WorkerProcess:
 
 
 class ProcessPool:
-    """`WorkerPool` of processes on this machine; one that dies costs its recording, and is replaced.
-
-    `wait` raises DeviceError if processes end before they are ready.
-    """
+    """`WorkerPool` of processes on this machine; one that dies costs its recording, and is replaced."""
 
     def __init__(self, size: int) -> None:
         self._size = size

@@ -92,15 +92,9 @@ def prepare_recording(
     warn: Callable[[str], None] = lambda _: None,
     show: _Show = lambda *_: None,
 ) -> Iterator[RecordingJob]:
-    """Open a recording and check every sensor, so that errors are reported before any processing.
-
-    ``max_bytes`` limits the images that wait to be written; see `SensorProcessing`. ``warn`` is called with a line for
-    each sensor that has faulty microphones, whose echoes do not match the call or the layout, or whose images may
-    exceed the error budget, and for each sensor with passive measurements, which are left out, or with level directions
-    from poses that tilt the platform by more than 30°. Raises DataError if microphones are faulty and
-    ``options.strict`` is set, the error of an image exceeds its budget and ``options.verify`` is set, or all
-    measurements are passive.
-    """
+    """Open a recording and check every sensor, so that errors are reported before any processing."""
+    # `warn` gets a line for each doubt. Raises DataError for faulty microphones with `options.strict`, an exceeded
+    # budget with `options.verify`, and without active measurements.
     with ExitStack() as stack:
         if settings is None:
             options.without.require_known(sensor_names(path))

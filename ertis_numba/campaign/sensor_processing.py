@@ -47,12 +47,9 @@ def describe_faults(name: str, report: Health, sensor: str = "") -> str:
 
 
 class SensorProcessing:
-    """Pipeline of one sensor, its predictions, and the time of each measurement.
+    """Pipeline of one sensor, its predictions, and the time of each measurement."""
 
-    ``batch`` is the number of measurements per batch; fewer if the images that wait to be written exceed ``max_bytes``,
-    `MAX_WAITING_BYTES` by default. ``attitudes`` are required if ``processing.level_directions`` is true. ``reported``
-    has results about the plan. ``prediction`` is None before the first image, and for the paper's method.
-    """
+    # `batch` is reduced to `max_bytes` of waiting images. `prediction` is None before the first image.
 
     def __init__(
         self,

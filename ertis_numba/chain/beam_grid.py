@@ -265,11 +265,8 @@ class BeamGrid:
         self.weights = weights.reshape(len(directions), -1, 2)
 
     def _coefficients_of(self, weights_at: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return polynomial coefficients of the weights in one grid cell: (degree, degree, tap).
-
-        A weight is a sum of waves over microphones and frequencies. Across a cell, these waves turn by at most half a
-        period. Polynomials therefore reproduce the weights in double precision, in a fraction of the time.
-        """
+        """Return polynomial coefficients of the weights in one grid cell: (degree, degree, tap)."""
+        # Weights are sums of waves that turn by at most half a period across a cell, so that polynomials are exact.
         spacing = self._spacing
         places = chebyshev.chebpts1(_POLYNOMIALS)
         inverse = np.linalg.inv(chebyshev.chebvander(places, _POLYNOMIALS - 1))
@@ -378,11 +375,8 @@ def _mics_and_waves(n_mics: int, n_waves: int, *, estimate: bool) -> tuple[NDArr
 
 
 def _evenly(count: int, n_axes: int) -> NDArray[np.float64]:
-    """Return places that an additive sequence spreads evenly over a cell: (place, axis) from 0 to 1.
-
-    The steps along the n axes are powers of 1 / x, for the positive root x of ``x^(n + 1) = x + 1`` (M. Roberts, The
-    unreasonable effectiveness of quasirandom sequences, 2018).
-    """
+    """Return places that an additive sequence spreads evenly over a cell: (place, axis) from 0 to 1."""
+    # Steps are powers of 1 / x for the positive root x of `x^(n + 1) = x + 1` (M. Roberts, 2018).
     root = {1: (1 + math.sqrt(5)) / 2, 2: 1.324717957244746}[n_axes]
     steps = root ** -np.arange(1.0, n_axes + 1)
     return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0)

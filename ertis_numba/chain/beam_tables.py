@@ -37,12 +37,9 @@ _Edges = list[tuple[int, int, float]]
 
 
 class BeamTables:
-    """Fits of a complete plan, and the tables of its beamformer for some directions.
+    """Fits of a complete plan, and the tables of its beamformer for some directions."""
 
-    ``own_s`` and ``ahead_s`` (mic,) are delays and fractional-delay offsets. ``largest_delay_s`` limits the delays of
-    these directions, or of any if the sensor may be tilted; ``margin_s`` is the reach of the delay interpolation beyond
-    a delay.
-    """
+    # `own_s` and `ahead_s` (mic,) are delays and fractional-delay offsets; `margin_s` is the reach of interpolation.
 
     def __init__(self, settings: Settings, grid: Grid, *, threads: int) -> None:
         plan, layout, spectrum = settings.accuracy, microphones(settings.array), spectrum_of(settings)
@@ -155,12 +152,9 @@ class BeamTables:
 
 
 class PlanStreams:
-    """Streams of a complete plan, with the points (point, axis) of each whose beams are summed.
+    """Streams of a complete plan, with the points (point, axis) of each whose beams are summed."""
 
-    The points are those of a beam grid, or the directions in the order of computation; ``reach`` limits their distance
-    from the centre, relative to the unit circle. ``linear`` is the index of the stream of the signals themselves, or
-    None.
-    """
+    # They are those of a beam grid, or the directions in the order of computation, within `reach` of the centre.
 
     def __init__(self, settings: Settings, spectrum: Spectrum, aperture: Aperture, speed_m_s: float) -> None:
         plan, recipe = settings.accuracy, recipe_of(settings.processing)

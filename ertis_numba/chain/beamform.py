@@ -70,10 +70,7 @@ class _NodeTables:
 
 
 class BeamformFloat32:
-    """Delay-and-sum beamformer on float32 samples; implements `Beamform`.
-
-    Focal zones together cover the range axis. Their beams are those of all directions, or of the points of ``nodes``.
-    """
+    """Delay-and-sum beamformer on float32 samples; implements `Beamform`."""
 
     def __init__(
         self,

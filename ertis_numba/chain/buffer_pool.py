@@ -42,10 +42,7 @@ class BufferPool:
 
     @contextmanager
     def acquired(self, make: Callable[[], MeasurementBuffers]) -> Iterator[MeasurementBuffers]:
-        """Run the enclosed code with buffers that no other thread uses; call `release` after the lane has finished.
-
-        If the enclosed code fails, the buffers are discarded, because kernels may still use them.
-        """
+        """Run the enclosed code with buffers that no other thread uses; call `release` after the lane has finished."""
         with self._change:
             if self._closed:
                 raise ArgumentError("the pipeline is closed; create another one")

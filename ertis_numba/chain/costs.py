@@ -133,11 +133,8 @@ def _transform(n: int) -> float:
 
 
 def nominal_costs(kernels: KernelSet) -> Costs:
-    """Return the published costs of a device, and of the CPU's instruction set.
-
-    They are the same on every machine, so that plans are the same on all machines with the same instruction set. Their
-    ratios count, not their values: use `measured_costs` to predict times.
-    """
+    """Return the published costs of a device, and of the CPU's instruction set."""
+    # Their ratios count, not their values: `measured_costs` predicts times.
     name = f"{kernels.device} {kernels.instruction_set}".strip()
     return Costs(NOMINAL_COSTS.get(name, NOMINAL_COSTS[_UNKNOWN]))
 

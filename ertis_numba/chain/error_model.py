@@ -228,10 +228,7 @@ class ErrorModel:
         return self._of(taps * step_2 / 6)
 
     def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
-        """Return the error power of noise that the decimation aliases into the band through the filter's stopband.
-
-        Noise covers the whole image. At image points darker than the noise, all of its power changes magnitudes.
-        """
+        """Return the error power of noise that the decimation aliases into the band through the filter's stopband."""
         settings = self._settings
         low_hz, high_hz = matched_band_hz(settings)
         frequency_hz, folded = self._filtered_noise(taps)
@@ -283,11 +280,8 @@ class ErrorModel:
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
-        """Return the error power of single precision.
-
-        PCM microphones may receive the same loud sound outside the window. They then round it alike, and their errors
-        add up in a beam. The noise of PDM bits differs between microphones, so that it prevents this.
-        """
+        """Return the error power of single precision."""
+        # PCM microphones may round loud sound outside the window alike; the noise of PDM bits prevents this.
         model = self.signal_model
         if not self._settings.recording.is_pdm:
             alike = effective_count(self._weights)

@@ -14,11 +14,8 @@ _MIN_M = 1e-9  # Minimum distance; it prevents a division by zero.
 
 
 def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
-    """Return focal zones (first, stop, distance in m of their mean curvature) in ``count`` equal steps of 1/r.
-
-    The delay of a microphone at p differs from that of a plane wave by about ``p²/2rc``. Equal steps of 1/r, not of r,
-    therefore give every zone the same error. Steps without a range yield no zone.
-    """
+    """Return focal zones (first, stop, distance in m of their mean curvature) in ``count`` equal steps of 1/r."""
+    # Equal steps of 1/r give every zone the same error, because extra delays are about `p²/2rc`.
     bends = 1 / np.maximum(range_m, NEAREST_M)
     span = bends[0] - bends[-1]
     zone = np.zeros(len(bends), dtype=int) if not span else np.floor((bends[0] - bends) / span * count).astype(int)

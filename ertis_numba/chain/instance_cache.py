@@ -12,11 +12,8 @@ _Result = TypeVar("_Result")
 
 
 def cached_in_instance(method: Callable[[_Self, *_Arguments], _Result]) -> Callable[[_Self, *_Arguments], _Result]:
-    """Return a method that computes each result once; its arguments are hashable and positional.
-
-    `functools.cache` of a bound method would refer to its instance, which then remains until the garbage collector
-    runs. `functools.cache` of the function would never free an instance.
-    """
+    """Return a method that computes each result once; its arguments are hashable and positional."""
+    # Unlike with `functools.cache`, nothing here keeps the instance alive.
     attribute = f"_results_of_{method.__name__}"
 
     @functools.wraps(method)

@@ -189,11 +189,8 @@ class DelayFit:
 
     @functools.cached_property
     def images(self) -> dict[int, NDArray[np.float64]]:
-        """Share of the error, (wave,), in each image of the spectrum by its number.
-
-        Relative to the wave, the error has the period of a step. It therefore consists of waves whose frequencies are
-        those of the spectrum plus the number of the image times the rate of the stored samples.
-        """
+        """Share of the error, (wave,), in each image of the spectrum by its number."""
+        # The error has the period of a step, so it consists of waves at distances of the rate of the stored samples.
         relative = self._wrong(self.fractions) * np.conj(self._wanted(self.fractions))
         power = np.abs(np.fft.fft(relative, axis=1)[:, _IMAGES]) ** 2
         total = np.maximum(power.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
@@ -224,11 +221,8 @@ class DelayFit:
 
     @functools.cached_property
     def _polynomials(self) -> NDArray[np.complex128]:
-        """Chebyshev coefficients of the weights over the fractions of one step: (degree, tap).
-
-        Each weight is a sum of waves at all frequencies of the spectrum. Their coefficients are Bessel functions of
-        half the phase of a step. Beyond the degree below, they are negligible in double precision.
-        """
+        """Chebyshev coefficients of the weights over the fractions of one step: (degree, tap)."""
+        # Those of a wave are Bessel functions of half the phase of a step.
         half_phase = math.pi * float(np.abs(self.spectrum.frequency_hz).max()) * self.step_s
         degree = math.ceil(1.5 * half_phase) + 20
         places = chebyshev.chebpts1(degree + 1)

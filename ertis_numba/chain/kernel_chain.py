@@ -36,10 +36,7 @@ class Compress(Protocol):
 
 
 class KernelChain(ABC):
-    """Runs the stages, which subclasses create in `_make`, in buffers of its own on lanes; implements `Chain`.
-
-    With ``graphs``, by default on every GPU, the chain is recorded as a CUDA graph and replayed.
-    """
+    """Runs the stages, which subclasses create in `_make`, in buffers of its own on lanes; implements `Chain`."""
 
     grid: Grid
     range_m: NDArray[np.float64]
@@ -129,10 +126,7 @@ class KernelChain(ABC):
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
     ) -> None:
-        """Process measurements in GPU lanes, or on one thread each.
-
-        If an item of ``outs`` is None, the image stays in GPU memory until the lane computes its next image.
-        """
+        """Process measurements in GPU lanes, or on one thread each."""
         pairs = list(zip(words, outs, strict=True))
         if self._memory.n_lanes == 1:
             self._side_by_side(pairs)
@@ -150,7 +144,7 @@ class KernelChain(ABC):
     def _side_by_side(self, pairs: list[tuple[NDArray[np.unsignedinteger[Any]], NDArray[np.float32] | None]]) -> None:
         """Process each measurement on one thread, because threads of one kernel wait for each other after each stage.
 
-        Fewer measurements than threads are processed one after the other, on all threads.
+        Threads of one kernel would wait for each other after each stage.
         """
         if len(pairs) < self._threads or self._threads == 1:
             for each, out in pairs:

@@ -1,10 +1,7 @@
 """Method of the 2019 paper on the kernels of a device.
 
-Jansen, Laurijssen, Kerstens, Daems and Steckel describe these steps: demodulation of the bits, matched filter,
-delay-and-sum with integer sample delays at the full signal rate, envelope and subsampling. Each step is a kernel or a
-transform here. The filters have linear phase, so that their group delay can be removed. Analytic signals make the
-envelope a magnitude, which replaces the rectifier and its low-pass filter. `paper_scipy` keeps the recursive filters of
-the authors, for comparison.
+The steps of Jansen, Laurijssen, Kerstens, Daems and Steckel, with filters of linear phase and analytic signals;
+`paper_scipy` keeps their recursive filters.
 """
 
 import math

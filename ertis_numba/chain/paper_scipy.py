@@ -1,9 +1,7 @@
 """Algorithm of the 2019 paper, in plain NumPy and SciPy on one thread.
 
-Jansen, Laurijssen, Kerstens, Daems and Steckel describe these steps: Butterworth demodulation, band-pass filter,
-matched filter, delay-and-sum with integer sample delays at the full signal rate, rectification, low-pass filter and
-subsampling. The algorithm is a reference for images and for speed. It is written as a careful user of NumPy would
-write it: float32 throughout, one call per filter, slices added in place.
+The steps of Jansen, Laurijssen, Kerstens, Daems and Steckel as a careful user of NumPy would write them: a reference
+for images and for speed.
 """
 
 import math
@@ -50,11 +48,8 @@ class ScipyPaperChain:
         self._make_matched_filter(settings, lead, weights)
 
     def _make_matched_filter(self, settings: Settings, lead: int, weights: NDArray[np.float64]) -> None:
-        """Compute the spectrum that correlates with the call and delays by ``lead`` samples.
-
-        The call passes through the same recursive filters as the signals. Their phase, and therefore their group delay,
-        cancels in the correlation, so an echo appears at its time of arrival.
-        """
+        """Compute the spectrum that correlates with the call and delays by ``lead`` samples."""
+        # The call passes through the same recursive filters as the signals, so that their phase cancels.
         call = _filtered_call(settings, self._demodulate)
         # The transform holds all samples that are read, the call and the leads, so nothing wraps around.
         n_needed = self._n_samples + self._low_pass.delay + len(call) + 2 * lead
@@ -170,11 +165,9 @@ def _halved(words: NDArray[Any], channels: list[int], scale: np.float32) -> NDAr
 
 
 class _Demodulate:
-    """Low-pass filter at the PDM rate, decimation, and band-pass filter at the signal rate.
+    """Low-pass filter at the PDM rate, decimation, and band-pass filter at the signal rate."""
 
-    Both filters are cascades of second-order sections, for which float32 suffices: the image differs by -111 dB from
-    that of float64 and takes 20 % less time. A transfer function of one polynomial would be unstable.
-    """
+    # Second-order sections suffice in float32, at -111 dB from float64; one polynomial would be unstable.
 
     def __init__(self, settings: Settings) -> None:
         call, rate_hz = settings.call, settings.signal_rate_hz

@@ -1,8 +1,4 @@
-"""Delay-and-sum beamforming with exact delays, which are phase shifts of spectra.
-
-The spectra of all microphones are delayed and summed within the band of the call, for every direction. An inverse
-transform per direction then gives the beam at the output rate. No delay is rounded or interpolated.
-"""
+"""Delay-and-sum beamforming with exact delays, which are phase shifts of spectra."""
 
 from collections.abc import Iterable, Iterator
 from typing import Final
@@ -34,11 +30,9 @@ def rows_at_a_time(n_directions: int, n_outputs: int) -> int:
 
 
 class PhaseShifts:
-    """Delay-and-sum beamformer that delays spectra by phase shifts; the filter's gains include microphone weights.
+    """Delay-and-sum beamformer that delays spectra by phase shifts; the filter's gains include microphone weights."""
 
-    ``zones`` cover the range axis: ranges ``first … stop - 1``, and delays (direction, mic) in seconds. ``shape``
-    (direction, 1, sample) is that of the beams that are transformed at a time.
-    """
+    # `zones`: ranges `first … stop - 1` and delays (direction, mic) in s; `shape`: beams (direction, 1, sample).
 
     def __init__(
         self,

@@ -1,7 +1,4 @@
-"""Elements of a complete plan: spectrum, decimation filter, ringing, offsets and focal zones.
-
-Errors and sizes of interpolations are cached, because many plans share them and they dominate the time of a planner.
-"""
+"""Elements of a complete plan: spectrum, decimation filter, ringing, offsets and focal zones."""
 
 import functools
 import math
@@ -121,23 +118,16 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
 
 
 def ringing_db(settings: Settings) -> float:
-    """Return the level below its peak at which the ringing of the matched filter may be cut off.
-
-    The noise of PDM bits masks ringing below the stopband. PCM has no such noise: sound outside the window may exceed
-    the image by the whole dynamic range, and its ringing must still stay below the error budget.
-    """
+    """Return the level below its peak at which the ringing of the matched filter may be cut off."""
+    # The noise of PDM bits masks ringing below the stopband. PCM has none, so all ringing must stay within the budget.
     if not settings.recording.is_pdm:
         return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
     return min(_MAX_PDM_RINGING_DB, max(60.0, 1.2 * (settings.accuracy.stopband_attenuation_db or 60.0) - 12.0))
 
 
 def ahead_of(weights: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
-    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64.
-
-    Without offsets, microphones with equal delays, such as those of the direction straight ahead, would have equal
-    interpolation errors. Multiples of the golden ratio spread the offsets of any few consecutive microphones evenly.
-    The order is that of descending array weights, so the offsets of a few dominant microphones are spread evenly, too.
-    """
+    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64."""
+    # Multiples of the golden ratio spread those of the few dominant microphones, and of equal delays, evenly.
     rank = np.empty(len(weights), dtype=np.intp)
     rank[np.argsort(-weights, kind="stable")] = np.arange(len(weights))
     return np.asarray(rank * (math.sqrt(5) - 1) / 2 % 1.0 * step_s)

@@ -129,11 +129,7 @@ class PlanModel:
         )
 
     def parts(self, plan: ImagePlan, *, noise_only: bool = False) -> dict[str, float]:
-        """Return the error power of each step of a plan, relative to the exact image of delay-and-sum.
-
-        Errors of streams are those of the image, divided by the safe sensitivity of the beamformer. They are larger for
-        images of noise only; the other errors are the same.
-        """
+        """Return the error power of each step of a plan, relative to the exact image of delay-and-sum."""
         if self.uses_streams(plan):
             return self._stream_parts(plan, noise_only=noise_only)
         parts = self._common_parts(plan)
@@ -205,12 +201,8 @@ class PlanModel:
         return self._stream_planner.plan(plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, delays_s)
 
     def _delays_between(self, nodes: Nodes, plan: ImagePlan, error: float) -> float:
-        """Return the error power of delays in beams that are interpolated between beam-grid points.
-
-        The interpolation averages errors that differ between grid points. These are images of the spectrum, waves of
-        other frequencies, which a fine grid suppresses. Without a measurement, the error is assumed to remain. Large
-        weights that nearly cancel each other add up the errors of their grid points.
-        """
+        """Return the error power of delays in beams that are interpolated between beam-grid points."""
+        # The interpolation suppresses errors that differ between grid points, such as images of the spectrum.
         step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
         fit, _ = fitted(self._spectrum, plan.delay_taps, step_s)
         if nodes.grid is None or self._few_delays(step_s) is not None:

@@ -28,10 +28,7 @@ class Deviation(NamedTuple):
 
 
 def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
-    """Return the deviation of a fast plan for unit vectors (direction, axis) of the whole grid; None if 0 or unknown.
-
-    With spherical wavefronts, interpolation between stored samples depends on the range and is not included.
-    """
+    """Return the deviation of a fast plan for unit vectors (direction, axis) of the grid; None if 0 or unknown."""
     plan = settings.accuracy
     unknown = None in {plan.oversampling, plan.delay_taps, plan.beam_taps}
     if settings.processing.method != "fast" or unknown or plan.delay_taps == 0:

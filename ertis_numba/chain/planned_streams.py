@@ -24,11 +24,9 @@ class ImageErrors:
 
 
 class ErrorShares(NamedTuple):
-    """Error power of the image relative to that of a stream; ``noise_share`` is that of noise in images of echoes.
+    """Error power of the image relative to that of a stream; ``noise_share`` is that of noise in images of echoes."""
 
-    ``noise`` and ``coherent`` hold for errors that differ between microphones, in noise and for an echo that reaches
-    all microphones alike; ``common`` for errors that all microphones share, and such an echo.
-    """
+    # `noise` and `coherent`: errors that differ between microphones, in noise and for an echo; `common`: shared ones.
 
     noise: float
     coherent: float
@@ -36,10 +34,7 @@ class ErrorShares(NamedTuple):
     noise_share: float
 
     def errors(self, *, whole: float, varying: float, common: float) -> ImageErrors:
-        """Return the error powers of images from those of a stream with its whole spectrum, and where it is bright.
-
-        The latter have a part that differs between microphones, ``varying``, and the rest, ``common``.
-        """
+        """Return the error powers of images from those of a stream with its whole spectrum, and where it is bright."""
         noise = _UNLIKE * self.noise * whole
         echoes = _UNLIKE * (self.coherent * varying + self.common * common) + self.noise_share * noise
         return ImageErrors(echoes, max(echoes, noise))
@@ -71,10 +66,7 @@ class PlannedStream:
 
 @dataclass(frozen=True, slots=True)
 class PlannedStreams:
-    """Streams of a plan as in `Recipe`, of which ``n_powers`` are power sums; negligible ones are left out.
-
-    ``delays`` has the errors due to interpolation of delays and power sums that are left out.
-    """
+    """Streams of a plan as in `Recipe`, of which ``n_powers`` are power sums; negligible ones are left out."""
 
     streams: list[PlannedStream]
     n_powers: int

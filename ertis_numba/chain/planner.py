@@ -83,11 +83,9 @@ def complete(
 
 
 class Planner:
-    """Planner for the measurements of one sensor on one device; values that the settings' accuracy fixes are kept.
+    """Planner for the measurements of one sensor on one device; values that the settings' accuracy fixes are kept."""
 
-    The signal model and the sensitivity of the beamformer are safe for any sound unless they are passed. ``max_bytes``
-    limits the memory of signals and delays. ``plan`` selects published or measured costs.
-    """
+    # Signal model and sensitivity are safe for any sound unless passed. `max_bytes` limits signals and delays.
 
     def __init__(
         self,
@@ -192,11 +190,7 @@ class Planner:
         return decibels(sum(self._image_parts(accuracy).values()))
 
     def budget_scope(self, accuracy: Accuracy) -> BudgetScope:
-        """Return the images for which a complete plan keeps its budget before a measurement.
-
-        The answer depends neither on the signal model nor on the sensitivity of this planner. Plans with streams may
-        exceed the budget where echoes are weaker than noise, or where many echoes overlap.
-        """
+        """Return the images for which a complete plan keeps its budget before a measurement."""
         if not self.settings.processing.is_adaptive:
             return "image"
         safe, allowed_db = Planner(self.settings, self._kernels, threads=self._threads), accuracy.max_error_db

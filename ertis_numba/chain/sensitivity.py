@@ -12,21 +12,16 @@ __all__ = ["Sensitivity"]
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """Error power of the image as a function of the error power p of the beams: ``linear · p + (quadratic · p)²``.
+    """Error power of the image as a function of the error power p of the beams: ``linear · p + (quadratic · p)²``."""
 
-    Delay-and-sum has 1 and 0. ``quadratic`` is for the cancellation of an echo with delay errors by Capon; it increases
-    as diagonal loading decreases.
-    """
+    # 1 and 0 for delay-and-sum; `quadratic` is for Capon, which cancels an echo with delay errors.
 
     linear: float = 1.0
     quadratic: float = 0.0
 
     @classmethod
     def of(cls, processing: Processing, n_mics: int) -> Self:
-        """Return a safe estimate for any sound, declared in the registry of beamformers and weightings.
-
-        The estimates result from perturbed weights in noise and in scenes of one echo and of 12 echoes.
-        """
+        """Return a safe estimate for any sound, declared in the registry of beamformers and weightings."""
         beamformer = BEAMFORMERS[processing.beamformer]
         linear, quadratic = beamformer.sensitivity(n_mics, *beamformer.values(processing))
         # Beam and factor have errors of the same signals, so that their relative errors add up as amplitudes.

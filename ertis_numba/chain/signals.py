@@ -25,11 +25,8 @@ def signals_of(
     window: TimeWindow | None = None,
     max_samples: int | None = None,
 ) -> NDArray[np.float32]:
-    """Return decimated signals (mic, sample) of the enabled microphones, divided by gains, with a full scale of 1.
-
-    Sample n lies at the recorded sample n times the decimation. Calibrated delays are not compensated. Without a
-    window, at most ``max_samples`` recorded samples are read.
-    """
+    """Return decimated signals (mic, sample) of the enabled microphones, divided by gains, with a full scale of 1."""
+    # Sample n lies at the recorded sample n times the decimation. Calibrated delays are not compensated.
     settings = settings or measurement.settings
     layout = microphones(settings.array)
     recorded = settings.recording.n_samples
@@ -45,10 +42,8 @@ def signals_of(
 
 
 def matched(signals: NDArray[np.float32], settings: Settings) -> NDArray[np.complex64]:
-    """Return signals from sample 0 on after the call's matched filter, analytic: (mic, sample).
-
-    An echo of amplitude 1 that starts at sample n has its peak there, with an envelope of 1.
-    """
+    """Return signals from sample 0 on after the call's matched filter, analytic: (mic, sample)."""
+    # An echo of amplitude 1 that starts at sample n has its peak there, with an envelope of 1.
     count = signals.shape[1]
     # The filter rings for the call's duration and a guard on either side; the padding keeps its ends apart.
     guard_s = settings.call.end_s + 2 * matched_guard_s(settings)

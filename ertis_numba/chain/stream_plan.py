@@ -135,11 +135,7 @@ class StreamPlanner:
         n_delay_taps: int,
         has_gain: bool,
     ) -> StreamGrid | None:
-        """Return the cheapest beam grid with an error up to ``limit``; None if direct sums are cheaper.
-
-        It has at most the taps and the density of the plan. The first stream, with an infinite limit, has exactly
-        these.
-        """
+        """Return the cheapest beam grid with an error up to ``limit``; None if direct sums are cheaper."""
         open_grids = [(beam_taps, density)]
         if limit < math.inf:
             open_grids = [

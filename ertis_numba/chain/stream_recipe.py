@@ -12,10 +12,7 @@ LINEAR: Final = SignalStream(1.0, 1)
 
 
 class Recipe(NamedTuple):
-    """Streams of a beamformer and a weighting: power sums, then those of the coherence factor; −1 for no such stream.
-
-    ``order`` is that of the product, 1 for delay-and-sum.
-    """
+    """Streams of a beamformer and a weighting: power sums, then those of the coherence factor; −1 for none."""
 
     streams: tuple[SignalStream, ...]
     order: int

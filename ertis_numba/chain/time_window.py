@@ -47,12 +47,8 @@ class TimeWindow:
 
 
 def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0) -> TimeWindow:
-    """Return the time window for beams with delays within ``± largest_delay_s``.
-
-    An echo at time t needs the samples from t on for the duration of the call. The window adds the ringing of the
-    matched filter to ``ringing_db`` on both sides. The transform is slightly longer, so wrapped samples lie outside
-    those that are read: the convolution is linear.
-    """
+    """Return the time window for beams with delays within ``± largest_delay_s``."""
+    # It adds the ringing of the matched filter on both sides, and is long enough for a linear convolution.
     speed_m_s = sound_speed_m_s(settings.air)
     first_m, last_m = settings.processing.range_m
     record_m = speed_m_s * (settings.recording.duration_s - settings.call.start_s) / 2

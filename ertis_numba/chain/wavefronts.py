@@ -19,10 +19,7 @@ def plane_wave_error_db(model: ErrorModel, settings: Settings, range_m: float) -
 
 
 def with_wavefront(settings: Settings, model: ErrorModel) -> Settings:
-    """Return settings with spherical wavefronts if plane ones exceed the error budget at the nearest range.
-
-    Beamformers without streams, own delays and the paper's method support only plane wavefronts.
-    """
+    """Return settings with spherical wavefronts if plane ones exceed the error budget at the nearest range."""
     processing = settings.processing
     beamformer = BEAMFORMERS[processing.beamformer]
     spherical = (

@@ -74,11 +74,7 @@ def foreign_stream() -> ArgumentError:
 
 
 class StreamedImage:
-    """Image (direction, range) of a measurement whose words (sample, word) arrive in pieces.
-
-    ``image`` computes it from buffers, for an array and a number of threads; nothing else uses the buffers. With
-    ``is_turned``, the directions are known only when the measurement is complete.
-    """
+    """Image (direction, range) of a measurement whose words (sample, word) arrive in pieces."""
 
     def __init__(
         self,

@@ -39,12 +39,9 @@ _AS_EVER = (0.3, 0.7)  # Share of differing bits there; near overload, which com
 
 
 class BitCheck:
-    """Detector of blocks that microphones cannot have sent.
+    """Detector of blocks that microphones cannot have sent."""
 
-    At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound. False
-    alarms were tested with simulated sensors and the only public measurement. ``density``, (channel,), is the share of
-    ones in the last checked block; 0 or 1 is a stuck microphone, which is no reason for rejection.
-    """
+    # `density` (channel,) is the share of ones in the last checked block. Splices are not found at 1.125 MHz.
 
     def __init__(
         self,
@@ -94,10 +91,7 @@ class BitCheck:
         return "splice" if self._splices and self._splices.found(self._words, mean, moving) else None
 
     def _stops(self, share: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Return True if long runs of equal words begin and end among varying words, or with the block.
-
-        Words may also be equal in overload, but modulators enter and leave it one after the other.
-        """
+        """Return True if long runs of equal words begin and end among varying words, or with the block."""
         if _longest(share < -1 + 0.5 / (CHANNELS * MEAN_OF)) < _EQUAL_WORDS // MEAN_OF - 3:
             return False
         mask = np.sum(np.uint32(1) << np.flatnonzero(moving).astype(np.uint32), dtype=np.uint32)
@@ -112,11 +106,9 @@ class BitCheck:
         return False
 
     def _chance(self, mean: Floats, power: Floats, product: Floats) -> str | None:
-        """Return ``density`` or ``noise`` if bits are not those of modulators, in the block or in a stretch.
-
-        ``mean`` has shape (channel, n): means of 31 samples each. ``power`` and ``product``, both (n,), are the mean
-        square of these means, and the mean product of neighbours minus that square.
-        """
+        """Return ``density`` or ``noise`` if bits are not those of modulators, in the block or in a stretch."""
+        # `mean` (channel, n) of 31 samples each; `power`, `product` (n,): mean square, and product of neighbours minus
+        # it.
         low, high = _POWER_RANGE
         usual, middle = np.quantile(product[:: _EVERY // 4], [0.25, 0.5])
         if usual > _UNSHAPED:

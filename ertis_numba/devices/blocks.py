@@ -1,7 +1,4 @@
-"""Measurements in the form of a sensor's blocks, with arrival times.
-
-A block consists of header, counter, PDM words and footer; it contains neither its length nor its time.
-"""
+"""Measurements in the form of a sensor's blocks, with arrival times."""
 
 from dataclasses import dataclass
 from typing import Final

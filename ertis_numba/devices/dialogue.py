@@ -21,10 +21,7 @@ _log = logging.getLogger("ertis_numba")
 
 
 class Dialogue(SerialLine):
-    """Serial line with commands and answers, which differ from data only in that nothing follows them.
-
-    ``dropped`` counts bytes without a request.
-    """
+    """Serial line with commands and answers, which differ from data only in that nothing follows them."""
 
     def __init__(self, path: str, *, timeout_s: float, stop: Callable[[], bool]) -> None:
         super().__init__(path, stop=stop)
@@ -32,10 +29,7 @@ class Dialogue(SerialLine):
         self._timeout_s = timeout_s
 
     def drain(self, *, within_s: float, repeat: Command | None = None) -> int:
-        """Drop bytes until none arrive; return their number without the answers to ``repeat``.
-
-        ``repeat`` is sent again and again while bytes keep coming: the first may have followed half of another command.
-        """
+        """Drop bytes until none arrive; return their number without the answers to ``repeat``."""
         count = n_answers = 0
         began = last = reported = time.monotonic()
         while True:
@@ -61,11 +55,8 @@ class Dialogue(SerialLine):
         self.dropped = before + max(0, count - _ANSWER_BYTES)
 
     def ask(self, command: Command | CustomCommand, *, alone: bool = True) -> int:
-        """Send a command and return its answer; alone is false where measurements may follow it.
-
-        Earlier bytes are dropped. If more than an answer arrives, it belonged to something else: the command is sent
-        again.
-        """
+        """Send a command and return its answer; alone is false where measurements may follow it."""
+        # Earlier bytes are dropped. If more than an answer arrives, the command is sent again.
         deadline = time.monotonic() + self._timeout_s
         while True:
             if self.waiting:

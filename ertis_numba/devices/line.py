@@ -52,11 +52,9 @@ _log = logging.getLogger("ertis_numba")
 
 
 class SerialLine:
-    """Serial port for exclusive use; other threads may call only `close`.
+    """Serial port for exclusive use; other threads may call only `close`."""
 
-    ``stop`` is called some hundred times a second; once it returns True, reads and writes raise an error. Opening
-    raises SonarError with ``errno`` ENOENT, EBUSY, EACCES, or EINVAL for a path that is not a serial port.
-    """
+    # Once `stop` returns True, reads and writes raise an error. Opening raises SonarError with its `errno`.
 
     def __init__(self, path: str, *, stop: Callable[[], bool]) -> None:
         self.path = path
@@ -79,11 +77,8 @@ class SerialLine:
                 raise self._gone() from error
 
     def receive(self, missing: int) -> tuple[bytes, Instant]:
-        """Return bytes that arrive within some milliseconds, perhaps none, and the time of the first.
-
-        ``missing`` is the number of bytes still missing of a block or answer. With 0, a new one may begin: its first
-        byte is returned alone as soon as it arrives, unless it has arrived before.
-        """
+        """Return bytes that arrive within some milliseconds, perhaps none, and the time of the first."""
+        # `missing` is the number of bytes missing of a block or answer; 0 returns the first byte of a new one alone.
         with self._lock:
             self._check()
             try:

@@ -43,11 +43,9 @@ def emulated_folder() -> Path:
 
 
 class HeldLink:
-    """Symbolic link that belongs to one emulated device during its life; replaces that of a killed device.
+    """Symbolic link that belongs to one emulated device during its life; replaces that of a killed device."""
 
-    A lock on a hidden file beside the link shows if the device is alive. The existence of the port does not, because
-    the system reuses its number.
-    """
+    # A lock on a hidden file shows if the device is alive; the system reuses numbers of ports.
 
     def __init__(self, path: Path) -> None:
         require_terminals()

@@ -34,10 +34,7 @@ def call_codes(call: Call) -> NDArray[np.uint16]:
 
 
 def call_from_codes(codes: NDArray[np.uint16], rate_hz: float) -> Call:
-    """Return the call of converter codes, with a peak of 1, without silence at the end.
-
-    If the waveform would be too long for settings, silence at its start becomes the delay of the call.
-    """
+    """Return the call of converter codes, with a peak of 1, without silence at the end."""
     loud = np.flatnonzero(np.abs(codes - 2047.5) > 0.5)  # Silence is 2048, or 2047 if its samples are negative.
     samples = (codes[: loud.max(initial=-1) + 2] + 0.5 - 2048) / 2047  # Codes were rounded down.
     n_silent = max(0, int(loud[0]) - 1) if len(samples) > MAX_WAVEFORM_SAMPLES else 0

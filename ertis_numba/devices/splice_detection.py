@@ -101,10 +101,7 @@ class Splices:
         return pdm_rate_hz >= _MIN_RATE_HZ
 
     def found(self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Return True if there is a splice in (sample, 1) words; mean is (channel, n), of `MEAN_OF` samples each.
-
-        ``moving``, (channel,), is true for channels with a microphone that is not stuck.
-        """
+        """Return True if there is a splice in (sample, 1) words; mean is (channel, n), of `MEAN_OF` samples each."""
         if self._n_samples < 8 * self._edge * _STEP:
             return False
         band = self._filter(words)
@@ -133,11 +130,7 @@ class Splices:
     def _is_splice(
         self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_], at: int, variance: float
     ) -> bool:
-        """Return True if the impulse near sample ``at`` is a splice; ``variance``: of sizes by noise alone.
-
-        Impulses of any size are fitted to each channel, all at the sample where they explain most. Quadrature
-        components represent sound, which reaches some microphones slightly earlier or later.
-        """
+        """Return True if the impulse near sample ``at`` is a splice; ``variance``: of sizes by noise alone."""
         if not _NOISE[0] < math.sqrt(variance) < _NOISE[1] or _is_loud(mean[moving], at):
             return False
         at = min(max(at, self._reach + _REACH), self._n_samples - self._reach - _REACH - 1)

@@ -73,12 +73,8 @@ def draw_spectrogram(canvas: Canvas, measurement: Measurement, *, direction_deg:
 def power_spectra(
     values: NDArray[np.float32], rate_hz: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean squares (bin, time) in bins of about 1 kHz, of (channel, sample), with frequencies and times.
-
-    Bins are narrower at sample rates below 90 kHz. The window is Hann's, and spectra overlap by three quarters (P. D.
-    Welch, 1967). Sums over all bins are the mean square of the signals, of which the mean is taken. In a long record, a
-    column is the mean of several spectra.
-    """
+    """Return mean squares (bin, time) in bins of about 1 kHz, of (channel, sample), with frequencies and times."""
+    # Spectra under a Hann window overlap by three quarters (P. D. Welch, 1967); sums over all bins are the mean square.
     size = scipy.fft.next_fast_len(round(rate_hz / min(_SPACING_HZ, rate_hz / _LEAST_SIZE)), real=True)
     size += size % 2
     if values.shape[1] < size:

@@ -37,10 +37,7 @@ def signals(measurement: Measurement) -> MicrophoneTraces:
 
 
 def echoes(measurement: Measurement) -> MicrophoneTraces:
-    """Return envelopes of echoes at all samples of the range window, without calibrated gains and delays.
-
-    An echo of the whole call at full scale is 1.
-    """
+    """Return envelopes of echoes at all samples of the range window, without calibrated gains and delays."""
     given = measurement.settings
     step = given.decimation
     settings = given.replace(

@@ -53,11 +53,7 @@ class Panel:
 def compose(
     canvas: Canvas, heading: Heading, panels: Sequence[Panel], *, width_pt: float = 720.0, stacked: bool = False
 ) -> Figure:
-    """Return a page; Matplotlib's constrained layout places the pictures.
-
-    On a wide page, the pictures are beside each other unless ``stacked``, with colour bar and list on their right. On a
-    narrow one, all parts are below each other. ``width_pt`` applies if the style has none.
-    """
+    """Return a page; Matplotlib's constrained layout places the pictures."""
     style, em_pt, rows = canvas.style, canvas.style.em_pt, canvas.rows()
     width_pt = width_pt if style.width_pt is None else style.width_pt
     wide, margin_pt = width_pt >= _WIDE_EMS * em_pt, min(style.margin_pt, em_pt)

@@ -61,10 +61,7 @@ def polar_raster(
     right_m: NDArray[np.float64],
     ahead_m: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return levels (azimuth, range) at points of the horizontal plane: (row, column), NaN outside of the image.
-
-    Interpolation is bilinear between directions and rising ranges. The value is NaN if no direction is near.
-    """
+    """Return levels (azimuth, range) at points of the horizontal plane: (row, column), NaN outside of the image."""
     ahead_m = ahead_m[:, None]
     direction, near = fan.directions(right_m, ahead_m)
     places = np.arange(len(range_m))
@@ -93,10 +90,8 @@ def sphere_raster(
     azimuth_rad: NDArray[np.float64],
     elevation_rad: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return levels (direction,) over azimuth and elevation: (row, column), NaN where no direction is near.
-
-    The value is the mean of the four nearest unit vectors, in any arrangement, weighted by inverse square distance.
-    """
+    """Return levels (direction,) over azimuth and elevation: (row, column), NaN where no direction is near."""
+    # It is the mean of the four nearest unit vectors, weighted by inverse square distance.
     looks = unit_vectors(*(grid.ravel() for grid in np.meshgrid(azimuth_rad, elevation_rad)))
     return look_raster(level_db, directions, looks.reshape(len(elevation_rad), len(azimuth_rad), 3))
 
@@ -116,10 +111,7 @@ def volume_raster(
     *,
     points_m: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return levels (direction, range) at points of space: (row, column), NaN outside of the image.
-
-    Interpolation is linear between rising ranges, and that of `sphere_raster` between unit vectors (direction, axis).
-    """
+    """Return levels (direction, range) at points of space: (row, column), NaN outside of the image."""
     flat_m = points_m.reshape(-1, 3)
     radius_m = np.linalg.norm(flat_m, axis=1)
     column = np.interp(radius_m, range_m, np.arange(len(range_m)), left=np.nan, right=np.nan)

@@ -114,12 +114,9 @@ def _row_ticks(axes: Axes, channels: NDArray[np.int64], *, em_pt: float) -> None
 def spectrogram(
     heard: MicrophoneTraces, settings: Settings
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of short spectra, mean over microphones: (frequency, time), with frequencies and times.
-
-    The length of the Hann window, ``2 √(T / B)``, is about the time for which the call stays within the bandwidth of
-    the window: a sweep is sharpest there. In a long record, a column is the maximum of many spectra with an overlap of
-    half or more, so that it misses no echo.
-    """
+    """Return the power of short spectra, mean over microphones: (frequency, time), with frequencies and times."""
+    # The window of `2 √(T / B)` is about as long as the call stays within its bandwidth. Columns of long records are
+    # maxima.
     call, rate_hz = settings.call, settings.signal_rate_hz
     swept_hz = call.high_frequency_hz - call.low_frequency_hz
     count = len(heard.axis)
@@ -145,10 +142,7 @@ def spectrogram(
 
 
 def _traces(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, loudest: float) -> None:
-    """Draw a row for each trace, the first on top; louder parts are clipped.
-
-    Amplitudes are compressed, so that echoes are visible beside the direct sound, which is 20 to 40 dB louder.
-    """
+    """Draw a row for each trace, the first on top; louder parts are clipped."""
     linear = max(_COMPRESSED * loudest, 2 * float(np.median(np.abs(heard.values))))  # noise is not enlarged
     values = np.arcsinh(heard.values / linear) / math.asinh(loudest / linear)
     time_ms, low, high = _ends(heard.axis * 1e3, np.clip(values / 2, -0.5, 0.5))

@@ -18,11 +18,7 @@ _METRES = " m"
 def draw_grid(
     axes: Axes, style: Style, fan: Fan, *, first_m: float = 0.0, largest: int = 6, spare_m: float = 0.0
 ) -> None:
-    """Draw labelled rings, first from first_m, and rays on axes in m right and ahead, whose limits are final.
-
-    ``largest`` is the largest number of parts between rings, and ``spare_m`` the distance from the image at which a
-    ring is still drawn.
-    """
+    """Draw labelled rings, first from first_m, and rays on axes in m right and ahead, whose limits are final."""
     line: dict[str, Any] = {"color": style.faint, "alpha": 0.35, "linewidth": 0.7 * style.line_pt}
     line |= {"clip_on": False, "scalex": False, "scaley": False}
     size_pt, first_rad = style.tick_pt, float(fan.azimuth_rad[0])

@@ -26,11 +26,8 @@ def data_array(
     settings: Settings,
     stamp: Stamp,
 ) -> "xarray.DataArray":
-    """Return a labelled array that shares memory with values; coords: (dimension, values, description, unit).
-
-    The settings become an attribute as TOML. The time of the stamp becomes the scalar coordinate ``time``, along which
-    `xarray.concat` joins several arrays; the rest are attributes.
-    """
+    """Return a labelled array that shares memory with values; coords: (dimension, values, description, unit)."""
+    # The settings become an attribute as TOML, and the time a scalar coordinate for `xarray.concat`.
     with extra("xarray", "to_xarray needs xarray"):
         import xarray as xr  # noqa: PLC0415  an optional dependency
     labels: dict[str, Any] = {

@@ -24,12 +24,8 @@ _USE: Final = "convert them with --pose-axes {0} (ertis import poses, ertis map)
 
 
 def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
-    """Return a note if poses tilt the platform as those of other frames or orders do.
-
-    Most poses tilt it by more than 30°, the path is steeper than 30°, it turns about its x or y axis only, or it is
-    level in the order w, x, y, z only. Poses of a camera, with z forward and y down, lay the platform on its side. If
-    the world has the axes of a camera as well, the platform seems to climb.
-    """
+    """Return a note if poses tilt the platform as those of other frames or orders do."""
+    # They tilt it by more than 30°, its path is steeper than 30°, or it is level in another order of the axes.
     up = _vertical_shares(rotation_xyzw)
     if (note := _order_note(rotation_xyzw, up)) is not None:
         return note

@@ -57,11 +57,9 @@ class SampleFormat(NamedTuple):
         return np.require(words, requirements=["C", "A", "W"]).reshape(rows)
 
     def normalised(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
-        """Return validated words in the range of single precision, and the exponent n of the divisor 2^n.
-
-        Images are linear in the words, so that the caller multiplies the image by the same power of two. Only
-        floating-point words are scaled, and only if their largest magnitude is far from 1.
-        """
+        """Return validated words in the range of single precision, and the exponent n of the divisor 2^n."""
+        # Only floating-point words are scaled, if their largest magnitude is far from 1. Images are linear in the
+        # words.
         if self.dtype.kind != "f" or not words.size:
             return words, 0
         largest = max(float(words.max()), -float(words.min()))

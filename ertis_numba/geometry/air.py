@@ -24,8 +24,7 @@ _VAPOUR_HEAT_RATIO = 1.330
 def sound_speed_m_s(air: Air) -> float:
     """Return the speed of sound in humid air, ``c = sqrt(γ R T / M)`` of an ideal mixture of dry air and water vapour.
 
-    The saturation pressure is that of ISO 9613-1, annex B. Dry air at 0 °C gives 331.3 m/s; humidity adds up to about
-    0.4 % at room temperature.
+    The saturation pressure is that of ISO 9613-1, annex B. Dry air at 0 °C gives 331.3 m/s.
     """
     kelvin = _ZERO_C_K + air.temperature_c
     vapour = _water_vapour_fraction(air)
@@ -52,11 +51,8 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
 
 
 def transmission_loss_db(air: Air, distance_m: float, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transmission loss of a spherical wave, ``20 log10(r / 1 m) + α r``, in dB: (frequency,).
-
-    The level at the distance r is the source level, at 1 m without absorption, minus this loss (R. J. Urick, Principles
-    of Underwater Sound, 1983).
-    """
+    """Return the transmission loss of a spherical wave, ``20 log10(r / 1 m) + α r``, in dB: (frequency,)."""
+    # See R. J. Urick, Principles of Underwater Sound, 1983.
     return 20 * math.log10(distance_m) + distance_m * absorption_db_m(air, frequency_hz)
 
 

@@ -19,10 +19,7 @@ _TURN = 2 * math.pi
 
 
 def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the angle from either end of each gap in which the value of that direction applies: (gap,).
-
-    A gap as wide as a neighbouring one is a coarser part of the grid, as in grids that are finer ahead.
-    """
+    """Return the angle from either end of each gap in which the value of that direction applies: (gap,)."""
     if len(gaps_rad) < 2:
         return np.full(len(gaps_rad), ALONE_RAD)
     usual_rad = np.sort(gaps_rad)[(len(gaps_rad) - 1) // 2]
@@ -31,11 +28,8 @@ def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> NDArray[np.float64]:
-    """Return azimuths, in any order, shifted by whole turns so that the widest gap lies outside of their interval.
-
-    The middle between the first and the last is from −π to π. Gaps up to ``closed_rad`` do not count, because
-    directions of other elevations lie in them.
-    """
+    """Return azimuths, in any order, shifted by whole turns so that the widest gap lies outside of their interval."""
+    # Gaps up to `closed_rad` do not count. The middle between the first and the last is from −π to π.
     turns = np.floor((azimuth_rad + math.pi) / _TURN)
     within = np.where(np.abs(azimuth_rad) > math.pi + 1e-9, azimuth_rad - _TURN * turns, azimuth_rad)
     rising = np.unique(within)

@@ -20,11 +20,8 @@ MAX_DELAY_S = 0.02
 
 
 def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64] | None:
-    """Return the delays in s, (direction, enabled mic), that ``processing.delay_matrix`` states; None without it.
-
-    Positive delays mean later sound. The mean over the layout's microphones is subtracted from each direction, so that
-    ranges count from the centre of the array, as they do with plane waves.
-    """
+    """Return the delays in s, (direction, enabled mic), that ``processing.delay_matrix`` states; None without it."""
+    # Positive delays mean later sound. Their mean over microphones is 0, so that ranges count from the array's centre.
     processing = settings.processing
     given = processing.delay_matrix
     if not given:

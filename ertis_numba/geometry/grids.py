@@ -65,11 +65,8 @@ def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[
 
 
 def direction_grid(processing: Processing) -> Grid:
-    """Return the directions that ``processing.directions`` names, or those of a list or a CSV file in degrees.
-
-    ``2d:N`` is N azimuths at one elevation, including both limits. ``3d:N`` is N cells of equal area between the
-    limits, in rows of equal elevation. ``90``, ``1850`` and ``3000`` are the paper's grids.
-    """
+    """Return the directions that ``processing.directions`` names, or those of a list or a CSV file in degrees."""
+    # `2d:N` is N azimuths at one elevation, `3d:N` N cells of equal area; 90, 1850 and 3000 are the paper's grids.
     name = processing.directions
     if not isinstance(name, str):
         angles_rad = np.radians(np.asarray(name, dtype=np.float64))
@@ -94,11 +91,8 @@ def _level_grid(n_directions: int, limits_deg: tuple[float, float], elevation_de
 def _equal_area_grid(
     n_directions: int, azimuth_limits_deg: tuple[float, float], elevation_limits_deg: tuple[float, float]
 ) -> Grid:
-    """Return rows of equal elevation, each split into cells of equal area, after Leopardi's zonal partition.
-
-    P. Leopardi, A partition of the unit sphere into regions of equal area and small diameter, ETNA 25 (2006). Here the
-    zones end at the limits, so that the number of cells is exact.
-    """
+    """Return rows of equal elevation, each split into cells of equal area, after Leopardi's zonal partition."""
+    # P. Leopardi, A partition of the unit sphere into regions of equal area and small diameter, ETNA 25 (2006).
     west, east = np.radians(azimuth_limits_deg)
     low, high = np.sin(np.radians(elevation_limits_deg))
     side_rad = math.sqrt((east - west) * (high - low) / n_directions) or 1.0

@@ -231,11 +231,8 @@ def self_contained(settings: Settings) -> Settings:
 
 
 def require_plausible_size(settings: Settings) -> None:
-    """Ask for the unit of an array whose size does not suit the sound that it receives.
-
-    Raise ArgumentError if the layout file states no unit, and the array would be smaller than a third of the shortest
-    wavelength; or the array is larger than 1 m and than the way that sound travels during a record.
-    """
+    """Ask for the unit of an array whose size does not suit the sound that it receives."""
+    # Raise ArgumentError below a third of the shortest wavelength without a unit, or above 1 m and the way of sound.
     layout, recording = microphones(settings.array), settings.recording
     speed_m_s = sound_speed_m_s(settings.air)
     span_m = float(np.ptp(layout.enabled_positions_m, axis=0).max())

@@ -15,14 +15,9 @@ _ROUNDING = 1e-9
 
 
 def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[np.bool_]]:
-    """Return directions of the level frame in the sensor frame, and a mask of those with x ≥ 0 behind the sensor.
-
-    The level frame has the origin and the heading ψ of the sensor, and its z axis points up: the result is ``Rᵀ Rz(ψ)
-    d`` for the rotation R of the sensor in the world, the unit quaternion ``attitude_xyzw``. Jansen, Laurijssen and
-    Steckel (arXiv 2406.06255) thus compensate pitch; this function also compensates roll. A planar array cannot
-    distinguish directions behind it. Raise ArgumentError for a sensor that looks straight up or down, because it has no
-    heading.
-    """
+    """Return directions of the level frame in the sensor frame, and a mask of those with x ≥ 0 behind the sensor."""
+    # The result is `Rᵀ Rz(ψ) d` for the rotation R of the sensor in the world and its heading ψ (Jansen, Laurijssen and
+    # Steckel, arXiv 2406.06255). Raise ArgumentError without a heading.
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
 
     try:

@@ -17,10 +17,7 @@ _UNIT = 1e-6  # deviation from length 1 due to rounding to six digits
 def mounting(
     sensor: str, translation_m: Sequence[float] | None = None, rotation_xyzw: Sequence[float] | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the validated translation and unit quaternion of a sensor on its platform; empty if both are unknown.
-
-    If one of them is missing, the sensor is at the origin, or its rotation is the identity.
-    """
+    """Return the validated translation and unit quaternion of a sensor on its platform; empty if both are unknown."""
     if translation_m is None and rotation_xyzw is None:
         return {}
     try:

@@ -49,11 +49,7 @@ class AzimuthColumns:
 
 
 def azimuth_columns(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> AzimuthColumns:
-    """Return columns of azimuths for display, each with the directions within half of their spacing.
-
-    If directions at several elevations have many different azimuths, a raster with a quarter of their spacing replaces
-    them. Directions in a plane have one column each.
-    """
+    """Return columns of azimuths for display, each with the directions within half of their spacing."""
     order = np.argsort(azimuth_rad, kind="stable")
     rising = azimuth_rad[order]
     columns = rising[np.diff(rising, prepend=-np.inf) > _NEAREST_RAD]

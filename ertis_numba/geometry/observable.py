@@ -24,11 +24,9 @@ _ABOVE_RAD: Final = math.radians(5.0)
 
 
 class ObservableAngles(NamedTuple):
-    """Angles that an array can observe: False for an angle if echoes from all of its values sound alike.
+    """Angles that an array can observe: False for an angle if echoes from all of its values sound alike."""
 
-    ``note`` is a predicate of the sensor with the unknown or ambiguous angles and the reason, None if there are none.
-    ``line`` (axis,) is the unit vector along an array on a line, None for others.
-    """
+    # `note` is a predicate with the angles and the reason; `line` is the unit vector along an array on a line.
 
     azimuth: bool
     elevation: bool
@@ -41,11 +39,9 @@ class ObservableAngles(NamedTuple):
         return self.azimuth or (self.line is not None and not (is_planar and is_upright))
 
     def observed_rad(self, azimuth_rad: float, elevation_rad: float, *, is_planar: bool) -> tuple[float, float]:
-        """Return the azimuth and the elevation of a direction; NaN for angles that the array cannot observe.
-
-        For arrays on a horizontal line, the azimuth is that of the direction in the horizontal plane that sounds alike.
-        It also remains if all compared directions lie at one elevation (``is_planar``).
-        """
+        """Return the azimuth and the elevation of a direction; NaN for angles that the array cannot observe."""
+        # For arrays on a horizontal line, the azimuth is that of the direction in the horizontal plane that sounds
+        # alike.
         if self.line is not None and self.azimuth and not is_planar:
             (direction,) = unit_vectors(np.array([azimuth_rad]), np.array([elevation_rad]))
             along = float(np.arctan2(self.line[1], self.line[0]))
@@ -141,11 +137,8 @@ def direction_note(array: Array, grid: DegreesFromRadians, *, is_passive: bool =
 
 
 def height_note(array: Array) -> str:
-    """Return a note on places in planar images: they are those of reflectors at the height of the sensor.
-
-    The azimuth of another reflector is that of the wave at elevation 0 that fits its wave best at the microphones. The
-    note has the largest error 5° above or below, at azimuths up to 45°.
-    """
+    """Return a note on places in planar images: they are those of reflectors at the height of the sensor."""
+    # The note has the largest error 5° above or below, at azimuths up to 45°.
     wrong_deg = math.degrees(_azimuth_error_rad(array))
     return (
         "all directions have elevation 0°, so positions and standard deviations hold for reflectors at the height of "

@@ -86,11 +86,8 @@ def _of_numpy(source: str, content: bytes) -> PositionTable:
 
 
 def _of_acoular(source: str, content: bytes) -> PositionTable:
-    """Return the positions in an XML file for `acoular.MicGeom`, in metres and turned into the sensor frame.
-
-    Its arrays mostly lie in x and y. The maps and sources of Acoular's examples lie at negative z, and x points to the
-    right for an observer behind the array who looks at them.
-    """
+    """Return the positions in an XML file for `acoular.MicGeom`, in metres and turned into the sensor frame."""
+    # Acoular's arrays mostly lie in x and y, with sources at negative z and x to the right of an observer behind.
     try:
         root = ET.fromstring(content)  # noqa: S314  Expat limits the expansion of entities.
     except ET.ParseError as error:

@@ -37,12 +37,8 @@ class PositionTable:
 
 
 def read_position_table(source: str, text: str) -> PositionTable:
-    """Return the positions in a table with one row per channel, in the order of the bits.
-
-    Cells are separated by commas, semicolons, tabs or spaces; a decimal comma is accepted unless commas separate. A
-    comment follows #, % or //. A header, or a comment above the positions, names the axes in any order and may state
-    their unit, as in ``x_m`` or ``y (mm)``. Without one, columns are ``y, z`` or ``x, y, z`` after names or numbers.
-    """
+    """Return the positions in a table with one row per channel, in the order of the bits."""
+    # Without a header or comment with names, columns are `y, z` or `x, y, z` after names or numbers.
     lines, comments = _without_comments(text)
     rows = list(_cells(lines))
     header = _header(rows)

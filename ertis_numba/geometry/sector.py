@@ -33,10 +33,7 @@ def round_step(length: float, largest: int) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fan:
-    """Sector that an image covers: ranges (first, last) and rising azimuths; several elevations show their maximum.
-
-    A thin image becomes two degrees wide, and a full circle ends with its first azimuth.
-    """
+    """Sector that an image covers: ranges (first, last) and rising azimuths; several elevations show their maximum."""
 
     azimuth_rad: NDArray[np.float64]
     range_m: tuple[float, float]

@@ -9,10 +9,7 @@ __all__ = ["received_settings"]
 
 
 def received_settings(text: bytes | str, source: str, *, are_applied: bool = False) -> Settings:
-    """Parse settings from an untrusted source, and reject names of files on this machine.
-
-    ``are_applied`` accepts any name of directions and delays, because they accompany the settings, and images exist.
-    """
+    """Parse settings from an untrusted source, and reject names of files on this machine."""
     if isinstance(text, bytes):
         if len(text) > Settings.max_bytes:  # before a copy of it is made
             raise SettingsError(f"{source}: {len(text)} bytes; the limit is {Settings.max_bytes}")

@@ -55,11 +55,8 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
 
 
 def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the call at any times after the start of the record; it is 0 outside ``[start_s, end_s]``.
-
-    A custom waveform is oversampled 16 times by its Fourier series, and then interpolated by cubic splines. Their error
-    is -100 dB at half of the sample rate, and less at lower frequencies.
-    """
+    """Return the call at any times after the start of the record; it is 0 outside ``[start_s, end_s]``."""
+    # A custom waveform is oversampled 16 times, and interpolated by cubic splines with an error of -100 dB.
     time_s = np.asarray(time_s) - call.start_s
     inside = (time_s >= 0.0) & (time_s <= call.duration_s)
     values = np.zeros(time_s.shape)
@@ -102,10 +99,8 @@ def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 def call_spectrum(
     call: Call, settings: Settings, *, n_fft: int, decimation: int | None = None
 ) -> NDArray[np.complex128]:
-    """Return the one-sided spectrum of a call in decimated signals: (bin,); ``n_fft`` is at least the call's length.
-
-    The call is sampled at the rate of the record. At the decimated rate, a short call without ramps would alias.
-    """
+    """Return the one-sided spectrum of a call in decimated signals: (bin,); ``n_fft`` is at least the call's length."""
+    # At the decimated rate, a short call without ramps would alias.
     decimation = settings.decimation if decimation is None else decimation
     return _call_spectrum(call, settings.recording.sample_rate_hz, n_fft, decimation)
 
@@ -117,10 +112,9 @@ def _call_spectrum(call: Call, sample_rate_hz: float, n_fft: int, decimation: in
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFilterSpectrum:
-    """The matched filter of a call as the occupied bins of a one-sided spectrum, (bin,), from ``first_bin`` on.
+    """The matched filter of a call as the occupied bins of a one-sided spectrum, (bin,), from ``first_bin`` on."""
 
-    ``echo_power``: power of the filtered call in any unit; ``centre_hz``: its mean frequency, weighted by this power.
-    """
+    # `echo_power` is that of the filtered call in any unit, and `centre_hz` its mean frequency.
 
     first_bin: int
     values: NDArray[np.complex128]
@@ -138,11 +132,8 @@ def matched_band_hz(settings: Settings) -> tuple[float, float]:
 
 
 def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
-    """Return the time that the matched filter rings before and after the call until it has fallen by ``down_db``.
-
-    The edges of its band are raised cosines, whose transform falls with the third power of time. Own filters extend it
-    by half of their length.
-    """
+    """Return the time that the matched filter rings before and after the call until it has fallen by ``down_db``."""
+    # The edges of its band are raised cosines, whose transform falls with the third power of time.
     low_hz, high_hz = matched_band_hz(settings)
     narrowest_hz = min(settings.call.low_frequency_hz - low_hz, high_hz - settings.call.high_frequency_hz)
     filters = settings.processing.filters(settings.signal_rate_hz)
@@ -207,10 +198,7 @@ def _matched_filter_spectrum(
 
 
 def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies in Hz, and shares of the power of white noise after the matched filter: (wave,), sum 1.
-
-    The band of an echo, which is weighted by its own spectrum as well, is slightly narrower.
-    """
+    """Return frequencies in Hz, and shares of the power of white noise after the matched filter: (wave,), sum 1."""
     rate_hz, fine_hz = settings.signal_rate_hz, 4 * settings.call.high_frequency_hz
     n_fft = round(max(8 * math.ceil(settings.call.end_s * fine_hz), 1024) * rate_hz / fine_hz)
     matched = matched_filter_spectrum(settings, n_fft=n_fft)
@@ -226,11 +214,8 @@ def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray
 def decimation_taps(
     *, sample_rate_hz: float, decimation: int, pass_hz: float, stopband_attenuation_db: float = _STOPBAND_ATTENUATION_DB
 ) -> NDArray[np.float64]:
-    """Return the anti-aliasing filter of a decimation, (tap,), with the sum 1: a sinc under a Kaiser window (1974).
-
-    It attenuates frequencies that would alias into ``0 … pass_hz`` by the stopband attenuation within half a decibel.
-    Its length is ``2 k · decimation + 1``, so the group delay is exactly k decimated samples.
-    """
+    """Return the anti-aliasing filter of a decimation, (tap,), with the sum 1: a sinc under a Kaiser window (1974)."""
+    # Its length is `2 k · decimation + 1`, so that the group delay is exactly k decimated samples.
     taps = _decimation_taps(sample_rate_hz, decimation, pass_hz, stopband_attenuation_db)
     return taps.copy()
 
@@ -273,11 +258,8 @@ def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.f
 
 
 def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16] | NDArray[np.int32]:
-    """Return (tap,) integers whose magnitudes add up to at most the largest integer of ``bits``, 16 or 32.
-
-    Sums over them are exact. Rounding some hundred taps to 16 bits changes the response by -65 dB or less. Raise
-    ArgumentError if there are so many taps that it changes by more than -50 dB.
-    """
+    """Return (tap,) integers whose magnitudes add up to at most the largest integer of ``bits``, 16 or 32."""
+    # Raise ArgumentError if there are so many taps that rounding changes the response by more than -50 dB.
     limit = np.iinfo(np.int16 if bits == 16 else np.int32).max
     scale = max(limit - len(taps) / 2, 0.0) / np.abs(taps).sum()  # Rounding adds up to half a unit per tap.
     whole = np.rint(taps * scale)

@@ -16,13 +16,9 @@ _SAMPLES = 4097  # of a window; the error of linear interpolation between them i
 
 
 def array_weights(settings: Settings) -> NDArray[np.float64]:
-    """Return the weight of each enabled microphone, by its distance from the centre, with a mean of 1: (mic,).
-
-    The aperture extends beyond the outermost microphone by half of the mean distance between neighbours, so that no
-    microphone has the weight 0. A mean of 1 preserves the level of an echo to which all microphones contribute in
-    phase, as ``wᴴv = 1`` does in the steered direction (H. L. Van Trees, Optimum Array Processing, 2002, sections 2.6
-    and 3.1).
-    """
+    """Return the weight of each enabled microphone, by its distance from the centre, with a mean of 1: (mic,)."""
+    # A mean of 1 preserves the level of an echo (H. L. Van Trees, Optimum Array Processing, 2002, sections 2.6 and
+    # 3.1).
     layout, given = microphones(settings.array), settings.processing.array_weights
     if given == "uniform":
         return np.ones(int(layout.enabled.sum()))

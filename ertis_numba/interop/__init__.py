@@ -1,6 +1,6 @@
 """Readers and writers of foreign formats.
 
-Names are imported when they are first used, because most of them need libraries that the others do not.
+Names are imported when they are first used, because most need libraries that others do not.
 """
 
 import lazy_loader

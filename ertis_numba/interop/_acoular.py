@@ -48,11 +48,7 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
 
 
 def read_acoular(path: Path) -> tuple[float, Samples, Settings | None]:
-    """Return sample rate in Hz, lazily read signals (sample, channel), and settings of own files, otherwise None.
-
-    The settings describe the file's content: only enabled microphones, without gains, because the signals are divided
-    by them, and ranges counted in its samples.
-    """
+    """Return sample rate in Hz, lazily read signals (sample, channel), and settings of own files, otherwise None."""
     with open_file(path, _WANTED) as file, reading(file, path):
         data = _time_data(file, path)
         shape = (*data.shape, 1) if data.ndim == 1 else data.shape

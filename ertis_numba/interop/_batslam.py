@@ -182,11 +182,8 @@ def _deltas(pose: Floats) -> Floats:
 
 
 def noise_model(true: Floats, measured: Floats) -> dict[str, Any]:
-    """Return the noise model of the simulator, fitted to the odometry.
-
-    The forward step is too long by a factor, the heading drifts by an angle per metre, and random errors of forward
-    step, step to the left and heading grow with the square root of the distance d.
-    """
+    """Return the noise model of the simulator, fitted to the odometry."""
+    # The step is too long by a factor, the heading drifts, and random errors grow with the root of the distance.
     distance_m = np.hypot(true[:, 0], true[:, 1])
     error = measured - true
     forward = float(np.sum(true[:, 0] ** 2))

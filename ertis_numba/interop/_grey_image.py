@@ -18,11 +18,9 @@ _MAX_PIXELS = 1000  # Limit along each side of a map.
 
 
 class GreyImage:
-    """Converter of images with the same directions to pictures.
+    """Converter of images with the same directions to pictures."""
 
-    A planar image becomes a picture of azimuth, from the left, and of range, from below. An image with elevations
-    becomes a map of azimuth and elevation as the sensor sees it: the maximum over range of the nearest direction.
-    """
+    # Planar images show azimuth and range from below; others azimuth and elevation, with the maximum over range.
 
     def __init__(self, image: Energyscape) -> None:
         self._columns = np.argsort(-unrolled_rad(image.azimuth_rad), kind="stable")

@@ -27,11 +27,8 @@ _SIGNAL_AXES = ("time_s", "positions_m", "delay_s")
 
 
 def write_npz(path: Path, results: Iterable[Result], count: int | None) -> None:
-    """Write the results of one sensor; one at a time if ``count`` is given, otherwise collect them first.
-
-    The samples have the shape (time, direction, range) or (time, microphone, sample), and the fields of the stamps
-    (time,). The axes, and sensor and settings as texts, follow. Angles are NaN if the array observes no directions.
-    """
+    """Write the results of one sensor; one at a time if ``count`` is given, otherwise collect them first."""
+    # Samples are (time, direction, range) or (time, microphone, sample). Unobserved angles are NaN.
     if count is None:
         gathered = list(results)
         results, count = gathered, len(gathered)

@@ -62,10 +62,8 @@ def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
 
 
 def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
-    """Write points as PCD 0.7, little-endian or text; refuse numbers beyond their type, and invalid names.
-
-    PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm.
-    """
+    """Write points as PCD 0.7, little-endian or text; refuse numbers beyond their type, and invalid names."""
+    # PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm.
     fields = POINT_FIELDS | dict.fromkeys("xyz", "<f4" if table.fits_float32 else "<f8")
     kinds = [np.dtype(dtype) for dtype in fields.values()]
     count = len(table.rows)

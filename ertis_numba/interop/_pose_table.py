@@ -80,11 +80,8 @@ _ORDER_OF_TUM: Final = _Columns(0, None, {"x": 1, "y": 2, "z": 3}, {"x": 4, "y":
 
 
 def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: str | None = None) -> PoseRows:
-    """Return the poses of a text.
-
-    ``needs_header`` refuses rows without a line that names the columns, instead of reading them as TUM or KITTI. Times
-    without a stated or given unit are read by their magnitude. ``times`` is a text with one time per pose of KITTI.
-    """
+    """Return the poses of a text."""
+    # `needs_header` refuses rows of TUM or KITTI; `times` is a text with one time per pose of KITTI.
     columns, rows = _header(text, needs_header=needs_header)
     if not rows:
         raise DataError("the file contains no poses; choose a file with at least one")

@@ -27,10 +27,8 @@ _DATE: Final = re.compile(
 
 
 def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Return times of (line, text) cells in ns, and notes on their unit.
-
-    Without a unit, it is that in which the times lie between 1973 and 2116; smaller ones are seconds.
-    """
+    """Return times of (line, text) cells in ns, and notes on their unit."""
+    # Without a unit, it is that in which the times lie between 1973 and 2116; smaller ones are seconds.
     dates = [_DATE.fullmatch(text.strip()) for _, text in cells]
     if cells and dates[0] is not None:
         return _times_of_dates(cells, dates)

@@ -137,10 +137,7 @@ def _assumption(skip_s: float, length_s: float | None) -> str:
 
 
 def _shortest(files: Sequence[PcmFile], several: Sequence[NDArray[np.int64]]) -> int:
-    """Return the smallest number of samples from an emission to the next one, or to the end of its file.
-
-    The end of a file with several emissions may cut off the last one, unless it nearly fits.
-    """
+    """Return the smallest number of samples from an emission to the next one, or to the end of its file."""
     intervals = [int(np.diff(starts).min()) for starts in several if len(starts) > 1]
     rests = [(file.n_samples - int(starts[-1]), len(starts)) for file, starts in zip(files, several, strict=True)]
     needed = _NEARLY * min([*intervals, *(rest for rest, count in rests if count == 1)])

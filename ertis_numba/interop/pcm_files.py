@@ -133,11 +133,8 @@ def inspect(path: Path, expansion: float | None = None) -> PcmFile:
 
 
 def joined(files: Sequence[PcmFile]) -> PcmFile:
-    """Return one file with the channels of all, cut to the shortest.
-
-    Raises DataError if the files differ in rate, type of numbers or time, or are in the order of the alphabet but not
-    of numbers.
-    """
+    """Return one file with the channels of all, cut to the shortest."""
+    # Raises DataError if they differ in rate, type of numbers or time, or are in alphabetical instead of numeric order.
     require_alike(files, joined=True)
     _require_one_measurement(files)
     first = files[0]

@@ -27,11 +27,8 @@ _UNKNOWN: Final = "set start_ns for the first file, or for each file"
 def file_times(
     files: Sequence[PcmFile], starts_ns: Sequence[int], *, first_s: Sequence[float]
 ) -> tuple[list[int], list[str]]:
-    """Return the time of each file's first measurement in ns since 1970, and notes; files are in order of time.
-
-    ``starts_ns`` are given by the user: none, the first, or one per file. ``first_s`` count from the starts of the
-    files.
-    """
+    """Return the time of each file's first measurement in ns since 1970, and notes; files are in order of time."""
+    # `starts_ns` are given by the user: none, the first, or one per file.
     if len(starts_ns) not in {0, 1, len(files)}:
         raise ArgumentError(
             f"start_ns has {len(starts_ns)} times for {len(files)} files; set the time of the first file, or that of "

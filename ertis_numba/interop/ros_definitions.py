@@ -1,9 +1,7 @@
 """Definitions of ROS 2 messages, and their encoder.
 
-Fields, types and constants are those of ``common_interfaces`` and ``geometry2`` (both the same from Humble on),
-``rcl_interfaces``, ``rosgraph_msgs``, and of ``marine_msgs`` 2.1.0 of the Applied Physics Laboratory, University of
-Washington. They are included here because a file contains the definitions of its messages. Neither writer nor file
-needs ROS.
+They are those of ROS, and of ``marine_msgs`` 2.1.0 of the University of Washington. A file contains the definitions of
+its messages, so that neither writer nor file needs ROS.
 """
 
 import functools

@@ -69,11 +69,9 @@ _INVALID_CHARACTERS = re.compile(r"[^A-Za-z0-9]+")
 
 
 class TopicNames(dict[str, str]):
-    """Name of each sensor in topics; characters that ROS does not allow become ``_``.
+    """Name of each sensor in topics; characters that ROS does not allow become ``_``."""
 
-    The topics of fused images, whose sensor is ``base_link``, lie in ``fused``. A later sensor of the same name gets a
-    number, such as ``a_b_2``.
-    """
+    # A later sensor of the same name gets a number, such as `a_b_2`.
 
     def __missing__(self, sensor: str) -> str:
         name = _INVALID_CHARACTERS.sub("_", checks.sensor_name(sensor)).strip("_")
@@ -92,11 +90,8 @@ def header(stamp: Stamp, *, frame: str | None = None) -> dict[str, Any]:
 
 
 def points_message(cloud: PointCloud) -> dict[str, Any]:
-    """Return points in the sensor frame, as sensor_msgs/msg/PointCloud2.
-
-    The fields are x, y, z in metres, intensity in dBFS, and the standard deviations of the position along range and
-    across it in metres, all FLOAT32. Unknown standard deviations are NaN.
-    """
+    """Return points in the sensor frame, as sensor_msgs/msg/PointCloud2."""
+    # Fields are x, y, z in m, intensity in dBFS, and standard deviations along and across range in m; NaN if unknown.
     rows = np.full((len(cloud), len(_POINT_FIELDS)), np.nan, dtype="<f4")
     rows[:, :3] = cloud.position_m
     with np.errstate(divide="ignore"):
@@ -219,11 +214,8 @@ def sonar_frame_message(stamp: Stamp) -> dict[str, Any]:
 
 
 def odometry_message(pose: PlanarPose, velocity: EgoVelocity | None) -> dict[str, Any]:
-    """Return the pose in ``odom`` and the velocity in the platform frame, as nav_msgs/msg/Odometry.
-
-    Height, roll and pitch are 0, and so are their covariances. An unknown velocity is 0, with the largest measurable
-    speeds as standard deviations.
-    """
+    """Return the pose in ``odom`` and the velocity in the platform frame, as nav_msgs/msg/Odometry."""
+    # Height, roll and pitch are 0. An unknown velocity is 0, with the largest measurable speeds as standard deviations.
     speed_m_s, yaw_rate_rad_s, covariance = (0.0, 0.0), 0.0, _UNKNOWN_TWIST
     if velocity is not None:
         speed_m_s, yaw_rate_rad_s = velocity.velocity_m_s.tolist(), velocity.yaw_rate_rad_s

@@ -26,11 +26,7 @@ _UNEVEN: Final = 0.1  # Largest distance of a range from an even spacing, relati
 
 
 def with_custom_files(folder: Path, reported: Mapping[str, Any], settings: Settings) -> Settings:
-    """Return settings with directions, delays and ranges of the CSV files that RTIS Dev settings name.
-
-    Delays are exact. The spacing of the ranges is the multiple of ``c / (2 · sample rate)`` that is nearest to that of
-    the file.
-    """
+    """Return settings with directions, delays and ranges of the CSV files that RTIS Dev settings name."""
     changes: dict[str, Any] = {}
     if "directionsCustom" in reported:
         angles_rad = _numbers(folder, reported, "directionsCustom")

@@ -43,11 +43,8 @@ class Emissions:
 
 
 def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, path: Path, channel: int) -> Emissions:
-    """Return the emissions in a loopback channel, by the matched filter of the call.
-
-    If no part of the channel resembles the call, its pulses are found by their onsets, as those of a trigger. ``read``
-    returns consecutive samples of the channel.
-    """
+    """Return the emissions in a loopback channel, by the matched filter of the call."""
+    # If no part of the channel resembles the call, its pulses are found by their onsets, as those of a trigger.
     times, match = _of_call(read, n_samples, call_samples(call, rate_hz=rate_hz), call.start_s * rate_hz)
     notes = []
     if len(times) and match < _GOOD_MATCH:
@@ -87,10 +84,7 @@ def louder_and_earlier(
     channel: int,
     n_channels: int,
 ) -> str:
-    """Return a note if another channel has the call louder and up to half an interval earlier.
-
-    Nothing contains a call before the loopback does, so ``channel`` may be that of a microphone.
-    """
+    """Return a note if another channel has the call louder and up to half an interval earlier."""
     at = float(emissions.times[0])
     interval = float(np.diff(emissions.times).min()) if len(emissions.times) > 1 else math.inf
     first = max(0, math.ceil(at - min(_MAX_EARLIER_S * rate_hz, interval / 2)))

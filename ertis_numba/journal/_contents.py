@@ -194,11 +194,8 @@ class ReadableJournal:
         return self._sensors[key.sensor].entry(self.path, rows[0])
 
     def entries(self, sensor: str | None = None) -> Iterator[JournalEntry]:
-        """Yield the measurements of one sensor or of all, in order of arrival, each read when it is requested.
-
-        Raises DamagedError if a measurement does not match its CRC-32, or the index does not list it; `index` and
-        `entry` give access to the others.
-        """
+        """Yield the measurements of one sensor or of all, in order of arrival, each read when it is requested."""
+        # Raises DamagedError if a measurement does not match its CRC-32, or the index does not list it.
         numbers = set(self._ids.values()) if sensor is None else {self._ids[self._sensor(sensor).name]}
         return self._in_order(self.index(sensor), numbers - self._unusable.keys())
 

@@ -139,11 +139,9 @@ class Database:
         self._is_folder_synced = True
 
     def use_rollback_journal(self) -> None:
-        """Switch to a rollback journal permanently, so that commits write to the main file at once.
-
-        A full log writes all data twice if each commit fills it, but needs one sync. A rollback journal stores only old
-        content, but a commit needs four syncs. After a DataError, nothing has changed.
-        """
+        """Switch to a rollback journal permanently, so that commits write to the main file at once."""
+        # A full log writes all data twice with one sync; a rollback journal stores only old content, but needs four
+        # syncs.
         if not self._uses_rollback_journal:
             self._set_rollback_mode("DELETE")
             self._uses_rollback_journal = True
@@ -151,11 +149,8 @@ class Database:
             self._is_folder_synced = self._is_log_durable = False
 
     def _set_rollback_mode(self, mode: str) -> None:
-        """Switch to a rollback journal.
-
-        A commit invalidates its header instead of removing it, because no other process can open the file. With
-        DELETE, it is removed by name when the file is closed.
-        """
+        """Switch to a rollback journal."""
+        # A commit invalidates its header instead of removing it, because no other process can open the file.
         if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
             raise DataError(f"{self._path} cannot switch from its log; close it, and try again")
 
@@ -248,11 +243,8 @@ class Database:
                 copy.close()
 
     def checkpoint_and_remove_log(self) -> None:
-        """Move everything to the main file and remove the log, so that closing touches no file by name.
-
-        Only `close` may follow, because an interrupted commit could no longer be rolled back. After a DataError, the
-        log stays.
-        """
+        """Move everything to the main file and remove the log, so that closing touches no file by name."""
+        # Only `close` may follow, because an interrupted commit could no longer be rolled back.
         for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # They roll back a commit that a disk error has interrupted.
             self.execute(statement)
         self._set_rollback_mode("PERSIST")

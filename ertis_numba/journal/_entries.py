@@ -56,11 +56,9 @@ class JournalKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JournalSensor:
-    """Sensor of a journal, with settings that depend on no other file; ``dtype`` of its data is little-endian.
+    """Sensor of a journal, with settings that depend on no other file; ``dtype`` of its data is little-endian."""
 
-    ``translation_m`` is its position on the platform, and the unit quaternion ``rotation_xyzw`` rotates the sensor
-    frame into the platform frame; both are None if the mounting is unknown.
-    """
+    # `rotation_xyzw` rotates the sensor frame into that of the platform; None if the mounting is unknown.
 
     name: str
     settings: Settings

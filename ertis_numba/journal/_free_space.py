@@ -25,11 +25,8 @@ def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int, has_poses:
 
 
 def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
-    """Refuse measurements or poses of given sizes after which a journal could not be sealed any more.
-
-    The disk of ``target`` needs space for the recording (``seals_bytes``) and a reserve; that of the journal for the
-    new content and for moving the log to the main file or, without a log, for the changed pages.
-    """
+    """Refuse measurements or poses of given sizes after which a journal could not be sealed any more."""
+    # The disk of `target` needs `seals_bytes` and a reserve, that of the journal the new content and changed pages.
     log = path.with_name(f"{path.name}-wal")
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)
     if log.exists():

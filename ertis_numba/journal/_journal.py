@@ -40,10 +40,7 @@ _LOCK_BYTES: Final = (0x40000000, 512)  # Lock bytes of SQLite, see https://sqli
 
 
 class Journal(WritableJournal):
-    """Durable measurements until they are sealed into the recording ``target``; threads may share it, processes not.
-
-    Create it with `create` or `open`, and close it. ``remark`` is a line about files that `create` has renamed.
-    """
+    """Durable measurements until they are sealed into the recording ``target``; threads may share it, processes not."""
 
     def __init__(self, path: Path, database: Database) -> None:
         super().__init__(path, database)
@@ -215,9 +212,7 @@ class Journal(WritableJournal):
 def choose_log(path: Path, log: WriteAheadLog) -> None:
     """Replace a damaged log that would damage its journal, and keep a copy of it; after an error, nothing has changed.
 
-    The log stays if the journal is intact with the part that SQLite reads. Otherwise it is replaced by a repaired log,
-    which SQLite reads completely, or removed, whichever gives an intact journal; if neither does, raise DamagedError.
-    A journal that another process has open is not changed.
+    A repaired log replaces it, or none, whichever gives an intact journal; if neither does, raise DamagedError.
     """
     with _locked(path) as is_unused:
         if not is_unused:

@@ -28,11 +28,9 @@ _PAGE_BYTES: Final = range(512, 65_537)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WriteAheadLog:
-    """A write-ahead log on the disk; SQLite reads ``n_read`` frames, up to the commit before a wrong checksum.
+    """A write-ahead log on the disk; SQLite reads ``n_read`` frames, up to the commit before a wrong checksum."""
 
-    ``n_frames`` counts those up to the last commit of this generation. ``n_lost_commits`` counts the commits that
-    SQLite will not read although they were synced; the last commit of a log never counts.
-    """
+    # `n_lost_commits` counts the commits that SQLite will not read although they were synced.
 
     content: bytes
     n_read: int
@@ -97,11 +95,8 @@ def read_log(path: Path) -> WriteAheadLog | None:
 
 
 def _count_lost(commits: NDArray[np.intp], sound: NDArray[np.bool_]) -> int:
-    """Count commits that a later transaction proves to be synced.
-
-    A later transaction counts if its checksums continue those of the previous commit. Remnants of earlier crashes after
-    the end consist of one transaction each, and their checksums continue no commit in the log.
-    """
+    """Count commits that a later transaction proves to be synced."""
+    # Its checksums must continue those of the commit, unlike remnants of earlier crashes.
     for place in range(len(commits) - 1, 0, -1):
         if sound[commits[place - 1] + 1 : commits[place] + 1].all():
             return place

@@ -27,8 +27,7 @@ _ROW_BYTES: Final = 100  # Numbers, checksum and index of a row: 91 to 102 bytes
 class JournalPose:
     """Pose of a platform in the world frame at a time since 1970-01-01 UTC, for the measurements of the sensors on it.
 
-    ``rotation_xyzw`` rotates the platform frame into the world frame. ``covariance`` has 6 by 6 little-endian doubles,
-    as in `Trajectory`; it is empty if unknown.
+    ``covariance`` has 6 by 6 little-endian doubles, as in `Trajectory`; it is empty if unknown.
     """
 
     sensors: tuple[str, ...]
@@ -86,8 +85,7 @@ def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
     """Return the trajectory through poses of one platform in any order; of several poses at one time, the first counts.
 
-    The covariance is None if that of any pose is unknown. The source lists the sources of the poses. An impossible pose
-    raises ArgumentError or ValueError.
+    The covariance is None if that of any pose is unknown. An impossible pose raises ArgumentError or ValueError.
     """
     time_ns, first = np.unique([pose.timestamp_ns for pose in poses], return_index=True)
     kept = [poses[index] for index in first]

@@ -35,8 +35,7 @@ skipped by the sensor.
 class _RecoveredRows:
     """Rows of a repaired copy that the journal lacks; ``is_complete`` if all rows have readable numbers without holes.
 
-    ``lost`` contains measurements with intact record and damaged samples. ``n_unreadable`` counts all other damaged
-    ones. ``pose_damage`` describes lost poses; it is empty if there are none.
+    ``lost`` measurements have an intact record and damaged samples; ``n_unreadable`` counts all others.
     """
 
     header: list[Any] = field(default_factory=list)

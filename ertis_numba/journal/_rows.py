@@ -127,11 +127,8 @@ class WritableJournal(ReadableJournal):
             self._has_poses = True
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
-        """Delete measurements up to a number that another node has stored, and gaps; durably. Return their number.
-
-        As rows of several sensors are interleaved, row numbers then have holes; the journal has version `VERSION`, and
-        readers count rows. A gap that extends beyond ``up_to`` is kept unchanged.
-        """
+        """Delete measurements up to a number that another node has stored, and gaps; durably. Return their number."""
+        # Row numbers then have holes, so that readers count rows. A gap that extends beyond `up_to` is kept unchanged.
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
         with self._lock:

@@ -130,12 +130,9 @@ def seal_in_subprocess(
     rests: float | None = None,
     progress: Progress = lambda _done, _of: None,
 ) -> SealingResult:
-    """Make the recording of a journal in a separate process, which Ctrl-C does not reach.
-
-    However it ends, the measurements are in the journal or in the recording, and sealing can be repeated. With
-    ``rests``, it runs at low priority, and pauses after each step for this multiple of its duration. Raises also
-    OSError if no process can be started, and KeyboardInterrupt, whose message states where the measurements are.
-    """
+    """Make the recording of a journal in a separate process, which Ctrl-C does not reach."""
+    # With `rests`, it pauses after each step for this multiple of its duration. Raises OSError if no process can be
+    # started, and KeyboardInterrupt, whose message states where the measurements are.
     replies: list[Sealed | StorageFailed] = []
     try:
         reason = _seal(SealJournal(journal, overwrite, rests), replies, progress)

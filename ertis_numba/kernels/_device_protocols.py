@@ -71,11 +71,9 @@ class Memory(Protocol):
 
 
 class NewMemory(Protocol):
-    """Creates the memory of a pipeline.
+    """Creates the memory of a pipeline."""
 
-    With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it: the default on devices that support
-    graphs, and an ArgumentError on others.
-    """
+    # With `graphs`, `Lane.run` records its steps and replays them; an ArgumentError on devices without graphs.
 
     def __call__(self, *, graphs: bool | None = None) -> Memory: ...
 

@@ -40,10 +40,8 @@ DEVICES: Final = {
 
 @functools.cache
 def load(device: str = "auto") -> KernelSet:
-    """Return the kernels of a device; "auto" is "cuda" if a GPU and its libraries are available, else `load_host`.
-
-    Raise ArgumentError for an unknown device, and DeviceError for one that cannot be used on this machine.
-    """
+    """Return the kernels of a device; "auto" is "cuda" if a GPU and its libraries are available, else `load_host`."""
+    # Raise ArgumentError for an unknown device, and DeviceError for one that cannot be used on this machine.
     checks.choice("device", device, ("auto", *DEVICES))
     if device == "auto":
         chosen = load("cuda") if _has_gpu() else load_host()

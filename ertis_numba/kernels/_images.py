@@ -1,7 +1,6 @@
 """Pool of image arrays, reused once nothing refers to them.
 
-Allocating an array takes as long as computing an image, because the operating system provides its pages one by one.
-Pinning them for a GPU takes even longer.
+Allocating an array takes as long as computing an image, and pinning it for a GPU even longer.
 """
 
 import threading

@@ -130,10 +130,8 @@ def between(low, high, part):
 
 @njit(inline="always", error_model="numpy", cache=True)
 def coherence_factor(real, imag, total_power, count):
-    """Return the coherence factor of ``count`` numbers from their sum and the sum of their powers.
-
-    The factor is limited to 1, so that rounding errors cannot raise a level, and is 0 for zero power. NaN propagates.
-    """
+    """Return the coherence factor of ``count`` numbers from their sum and the sum of their powers."""
+    # At most 1, so that rounding errors cannot raise a level, and 0 for zero power. NaN propagates.
     coherent = power(real, imag)
     total = count * total_power
     factor = coherent / total if total != 0 else np.float32(0)

@@ -39,10 +39,7 @@ class Window(NamedTuple):
 
 
 class CellGrid:
-    """Log-odds of square or cubic cells, whose corners are multiples of their side from the world's origin.
-
-    A grid of two dimensions has one layer; in three, ``height_m`` limits the height of cells.
-    """
+    """Log-odds of square or cubic cells, whose corners are multiples of their side from the world's origin."""
 
     def __init__(self, cell_m: float, n_dimensions: int = 2, height_m: tuple[float, float] = (-np.inf, np.inf)) -> None:
         self._cell_m, self._n_dimensions, self._height_m = cell_m, n_dimensions, height_m
@@ -61,10 +58,8 @@ class CellGrid:
         self._cells *= np.float32(factor)
 
     def view_from(self, place_m: Floats, rotation: Floats, radius_m: float) -> None:
-        """Begin a new viewpoint if sensors, within radius_m of the platform, have moved away from the present.
-
-        Ghosts repeat at the same places until the sensors move, so pulses from one viewpoint are one observation.
-        """
+        """Begin a new viewpoint if sensors, within radius_m of the platform, have moved away from the present."""
+        # Ghosts repeat at the same places until the sensors move, so pulses from one viewpoint are one observation.
         if self._viewpoint is not None:
             turned = math.sqrt(max(0.0, 3.0 - float(np.sum(rotation * self._viewpoint[1]))))  # Chord of the turn.
             if float(np.linalg.norm(place_m - self._viewpoint[0])) + radius_m * turned < _MOVED_M:

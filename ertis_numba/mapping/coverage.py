@@ -30,10 +30,7 @@ def directions_around(n_dimensions: int, reach_m: float, step_m: float) -> Polar
 
 
 def heard_m(emitters: Emitters, clear: float, floor: float, last_m: float) -> float:
-    """Return the distance to which a clear echo ahead, of amplitude ``clear`` at 1 m, exceeds the noise.
-
-    ``floor``, the detection threshold, is exceeded by noise anywhere in an image with a probability of 10⁻⁵.
-    """
+    """Return the distance to which a clear echo ahead, of amplitude ``clear`` at 1 m, exceeds the noise."""
     distance_m = np.asarray(last_m * _HEARD_STEP ** np.arange(_HEARD_STEPS), np.float64)
     is_heard = clear**2 * emitters.spreading(distance_m, distance_m) > floor**2
     return float(distance_m[is_heard.argmax()]) if is_heard.any() else 0.0
@@ -68,10 +65,7 @@ class Coverage(NamedTuple):
         heard_m: Sequence[float],
         height_m: float | None = None,
     ) -> Self:
-        """Return the coverage of sensors that emit, up to the distances ``heard_m``.
-
-        Directions in space are counted from ``height_m`` on the platform; without it, from each sensor in a plane.
-        """
+        """Return the coverage of sensors that emit, up to the distances ``heard_m``."""
         emitters = Emitters(settings, diameters_m)
         reach_m = max(
             float(np.hypot(*sensor.translation_m[:2])) + last

@@ -27,11 +27,8 @@ _NEAREST_M: Final = 0.01  # Range below which directions have no meaning.
 
 
 def displaced_covariance(covariance: Floats, offset_m: Floats) -> Floats:
-    """Return the covariance of the pose of places that move with a platform: (place, 6, 6).
-
-    A rotation by the small vector δ moves a place by δ × r, where r is its offset from the origin of the platform, in
-    the world. Covariances are those of x, y, z, and of the rotation about the world's x, y, z.
-    """
+    """Return the covariance of the pose of places that move with a platform: (place, 6, 6)."""
+    # A rotation by the small vector δ moves a place at r from the origin of the platform by δ × r.
     x, y, z = offset_m.T
     slopes = np.zeros((len(offset_m), 6, 6))
     slopes[:] = np.eye(6)

@@ -202,10 +202,7 @@ class Mapper:
         self._time_ns = max(time_ns, self._time_ns)
 
     def _view(self, translation_m: Floats, rotation: Floats, covariance: Floats) -> View:
-        """Return the view from the sensors in space, or from the platform with its heading in a plane.
-
-        Roll and pitch also move the sensors, if they are above or below the origin of the platform.
-        """
+        """Return the view from the sensors in space, or from the platform with its heading in a plane."""
         centre_m = rotation @ self._centre_m
         if self._dimensions == 3:
             return View(translation_m + centre_m, rotation, displaced_covariance(covariance, centre_m[None])[0])

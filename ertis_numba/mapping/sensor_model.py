@@ -1,7 +1,4 @@
-"""Inverse sensor model of a sonar: evidence for free and for occupied space from the points of one pulse.
-
-The same code serves planes and spaces: a plane has one layer of cells and one row of directions.
-"""
+"""Inverse sensor model of a sonar: evidence for free and for occupied space from the points of one pulse."""
 
 import math
 from typing import Final, NamedTuple
@@ -41,11 +38,9 @@ _TOUCHED: Final = 0.1  # Evidence of an echo above which a cell does not become 
 
 
 class Trust(NamedTuple):
-    """Trust in echoes, in log-odds.
+    """Trust in echoes, in log-odds."""
 
-    They come from a logistic regression of simulated reflectors and ghosts. ``cell`` and ``missed`` in the plane were
-    chosen to fit maps of simulated places.
-    """
+    # They come from a logistic regression of simulated reflectors and ghosts.
 
     clear: float  # of an unobstructed echo ahead of a sensor, besides its amplitude
     strength: float  # factor of the log-odds of the amplitude
@@ -147,10 +142,7 @@ def _first_clear_m(echoes: LocatedEchoes, cosine: Floats) -> Floats:
 def _end_m(
     echoes: LocatedEchoes, cosine: Floats, first_m: Floats, position_sd_m: float, rotation_sd_rad: float
 ) -> Floats:
-    """Return the end of free space in each direction: (direction,).
-
-    An error of the pose moves an echo along its direction and across it.
-    """
+    """Return the end of free space in each direction: (direction,)."""
     end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
     if not position_sd_m and not rotation_sd_rad:
         return np.asarray(end_m)
@@ -164,12 +156,8 @@ def _end_m(
 
 
 def _visible(echoes: LocatedEchoes, cosine: Floats, weight: Floats, hiding_m: Floats, wall_m: Floats) -> Floats:
-    """Return the share of the amplitude that passes the obstacles in front of echoes: (point,).
-
-    The share of directions that are open passes on the way to the reflector, and again on the way back. Around an echo,
-    obstacles within the beam, from ``hiding_m``, count: a wall fills it, and a post does not. In the direction of the
-    echo, a wall of the map, at ``wall_m``, hides everything behind it. ``weight`` is the solid angle of directions.
-    """
+    """Return the share of the amplitude that passes the obstacles in front of echoes: (point,)."""
+    # The open share of directions passes twice. Obstacles count from `hiding_m`, and a wall at `wall_m` hides all.
     passed = []
     for first_m, angle_rad, behind_m in ((hiding_m, _HALF_BEAM_RAD, _BEHIND_M), (wall_m, _HALF_RAY_RAD, _DEPTH_M)):
         is_near = cosine > math.cos(angle_rad)

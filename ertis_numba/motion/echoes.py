@@ -63,13 +63,10 @@ class GroupEchoes(NamedTuple):
 
 
 class EchoExtractor:
-    """Extractor of the echoes of images or point clouds, with tables computed once for each sensor.
+    """Extractor of the echoes of images or point clouds, with tables computed once for each sensor."""
 
-    Echoes of other sensors' calls are discarded if those sensors show the reflectors. Such echoes move differently from
-    own echoes: their emitter is elsewhere, and a flat array shows reflectors behind it as if they were ahead. They may
-    be half of all echoes. ``alone`` is True if no sensor emits except those of a group, and none radiates backwards to
-    reflectors; the default assumes this of a single piston with the origin and heading of the platform.
-    """
+    # Echoes of other sensors' calls, up to half of all, are discarded if those sensors show the reflectors. `alone` is
+    # True if no other sensor emits, and none backwards; the default assumes this of a single piston.
 
     def __init__(self, sensors: tuple[MountedSensor, ...], *, alone: bool | None = None) -> None:
         self._mounted = sensors
@@ -169,13 +166,9 @@ def _foreign(
     *,
     is_flat: bool,
 ) -> NDArray[np.bool_]:
-    """Return True for echoes of sensor ``number`` that the calls of other sensors explain: (echo,).
-
-    The other sensors show the reflectors closer to their own axes. At this sensor, the range of an echo of their calls
-    is the mean of the distances of the reflector from both sensors. If their calls begin later, half of the way that
-    sound travels meanwhile is added. Calls that differ do not count, since the matched filter suppresses them.
-    Reflectors behind a flat array appear ahead of it.
-    """
+    """Return True for echoes of sensor ``number`` that the calls of other sensors explain: (echo,)."""
+    # The range of such an echo is the mean of the distances of the reflector from both sensors. Reflectors behind a
+    # flat array appear ahead of it, and calls that differ do not count.
     places_m = np.array([sensor.translation_m for sensor in sensors])[echoes.sensor]
     axes = np.array([sensor.rotation[:, 0] for sensor in sensors])[echoes.sensor]
     local_m = sensors[number].local_m(echoes.position_m)

@@ -78,12 +78,8 @@ def fit_flow(
     second_twist: Floats | None = None,
     suspects: Sequence[Floats] = (),
 ) -> FlowFit | None:
-    """Return the displacement that explains most echoes, or None if there are too few.
-
-    All vectors are x, y in m and yaw in rad. ``reach`` is the largest difference from ``start``. Twists are velocities
-    at both groups in the frame of the platform, by default those of the displacement. ``suspects`` are other
-    displacements that may be right, for example by the groups before.
-    """
+    """Return the displacement that explains most echoes, or None if there are too few."""
+    # Vectors are x, y in m and yaw in rad. `suspects` are other displacements that may be right.
     flow = EchoFlow(before, after, sensors, time_s, (first_twist, second_twist))
     centre = np.zeros(3) if start is None else start
     limit = np.array([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) * time_s if reach is None else reach

@@ -30,11 +30,8 @@ class LiveOdometry:
         return self._odometry.trajectory if self._odometry is not None and self._odometry.poses else None
 
     def add(self, group: Mapping[str, Item], mountings: Mountings) -> tuple[PlanarPose, EgoVelocity | None] | None:
-        """Return pose and velocity at a group as `Odometry.add` does; None if it is not later than the last one.
-
-        An application that connects during a pulse misses images of it. If the second group has sensors that the first
-        one lacks, the path therefore begins with the second.
-        """
+        """Return pose and velocity at a group as `Odometry.add` does; None if it is not later than the last one."""
+        # An application may connect during a pulse, so the path begins with the second group if that has more sensors.
         if self._has_restarted(group):
             self._odometry = None
         is_second = self._odometry is not None and len(self._odometry.poses) == 1

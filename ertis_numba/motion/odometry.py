@@ -286,10 +286,7 @@ class Odometry:
         return time_after_ns(group, self._times_ns, last_ns)
 
     def _guess(self, found: FlowFit | None, time_s: float, timestamp_ns: int, *, has_copies: bool) -> None:
-        """Add the pose by the more likely of several motions, or else by the last velocity, for at most a second.
-
-        Errors of successive guesses have one cause, such as a person who walks by, so their deviations add up.
-        """
+        """Add the pose by the more likely of several motions, or else by the last velocity, for at most a second."""
         age_s = math.inf if self._twist_ns is None else (timestamp_ns - self._twist_ns) / 1e9
         if found is None:
             doubt: Doubt = "copies" if has_copies else "pause" if time_s > MAX_TIME_S else "few echoes"
@@ -382,10 +379,7 @@ def _significant(fit: FlowFit | None) -> FlowFit | None:
 
 
 def _of_change(before: Floats | None, after: Floats, echoes: GroupEchoes) -> Floats:
-    """Return the covariance (3, 3) of a displacement by a change of the velocity at an unknown instant.
-
-    Echoes are compensated with the mean velocity before their group, not with the velocity at the group.
-    """
+    """Return the covariance (3, 3) of a displacement by a change of the velocity at an unknown instant."""
     change = np.zeros(3) if before is None else after - before
     return np.asarray(np.diag((change * np.mean(echoes.arrival_s)) ** 2))
 

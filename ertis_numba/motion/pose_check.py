@@ -52,10 +52,7 @@ class _Way(NamedTuple):
 
 
 class PoseCheck:
-    """Check of the poses of pulses by the odometry of some of them.
-
-    Only ways that the echoes determine count, and only differences far beyond the errors of odometry and good poses.
-    """
+    """Check of the poses of pulses by the odometry of some of them."""
 
     def __init__(self, mountings: Mountings) -> None:
         self._mountings = mountings

@@ -117,11 +117,8 @@ class EchoFlow:
         return _predicted(displacement, self.before, self._offset_m, first, second)
 
     def strengths(self, pairs: EchoPairs) -> Floats:
-        """Return the weights of pairs in a comparison of displacements: (pair,).
-
-        Flat arrays hear the calls of neighbours from behind as if they came from ahead, and such echoes turn the other
-        way. They are as many as others, but weaker, so strong echoes count more: the root of their amplitude.
-        """
+        """Return the weights of pairs in a comparison of displacements: (pair,)."""
+        # Echoes from behind a flat array are as many as others, but weaker, so the root of the amplitude counts.
         levels = [echoes.level - echoes.level.max() for echoes in (self.before, self.after)]
         return np.asarray(np.exp((levels[0][pairs.before] + levels[1][pairs.after]) / 4))
 

@@ -44,13 +44,8 @@ def worst_rival(
     by_accident: float,
     expected: tuple[Floats, Floats] | None,
 ) -> tuple[Floats, float]:
-    """Return the displacement that rivals the best one most, and its score relative to the best one.
-
-    A flat array shows echoes from behind ahead, mirrored at its plane. They move as if the platform moved backwards and
-    turned the other way. If all arrays face along one line, all such echoes agree, and the mirrored motion, unless it
-    is far from the ``expected`` one, is a rival as soon as it explains more echoes than ``by_accident``. The ambiguity
-    is at least `MAX_AMBIGUITY` if the rival cannot be excluded.
-    """
+    """Return the displacement that rivals the best one most, and its score relative to the best one."""
+    # Echoes from behind a flat array agree with the mirrored motion, a rival if it explains more than `by_accident`.
     mirrored = [_mirrored(best.displacement, sensor) for sensor in _facing(flow, pairs, sensors)]
     rivals = [*found, *(hypothesis(flow, pairs, each, NEAR_SCALES) for each in mirrored)]
     judged = [(each.displacement, _ambiguity(flow, pairs, best, each, by_accident, mirrored)) for each in rivals]

@@ -189,10 +189,7 @@ def times_ns_of(group: Mapping[str, Item]) -> dict[str, int]:
 
 
 def time_after_ns(group: Mapping[str, Item], before: Mapping[str, int], before_ns: int) -> int:
-    """Return the time of a group after another one, by the clocks of the sensors of both.
-
-    Clocks of sensors may differ by more than a period of SYNC, so the time between the groups is the median of those by
-    each clock.
-    """
+    """Return the time of a group after another one, by the clocks of the sensors of both."""
+    # Clocks of sensors may differ by more than a period of SYNC, so the median of the times by each clock counts.
     passed_ns = [time_ns - before[sensor] for sensor, time_ns in times_ns_of(group).items() if sensor in before]
     return before_ns + round(float(np.median(passed_ns))) if passed_ns else stamp_of(group).timestamp_ns

@@ -157,10 +157,7 @@ class Subscription:
         self._dropped_before, self._missed_before = self._counts.dropped, self._counts.missed
 
     def _restarted(self) -> None:
-        """Start again on a connection to another publisher, which ZeroMQ has made at the same address.
-
-        The consumed count continues: a publisher counts from the first value that it receives.
-        """
+        """Start again on a connection to another publisher, which ZeroMQ has made at the same address."""
         numbers = self._numbers
         numbers.reader, numbers.received, numbers.next_number = ProductReader(), 0, 0
         self._counts.reconnects += 1

@@ -27,10 +27,8 @@ _HTTP_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*)(
 
 
 def endpoint(text: str, *, name: str = "address") -> str:
-    """Return an address ``tcp://HOST:PORT`` in the form of ZeroMQ; errors use its name.
-
-    A node that listens may have port 0 or ``*`` for a free port, and host ``*`` for all interfaces.
-    """
+    """Return an address ``tcp://HOST:PORT`` in the form of ZeroMQ; errors use its name."""
+    # A node that listens may have port 0 or `*` for a free port, and host `*` for all interfaces.
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
         raise ArgumentError(f"{name} {text!r} cannot be used; use tcp://HOST:PORT, such as {DEFAULT_LISTEN}")

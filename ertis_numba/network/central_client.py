@@ -166,10 +166,7 @@ class CentralClient:
         again_s: float | None = None,
         silent: str = "",
     ) -> Answer:
-        """Repeat a request until it is answered, once without again_s; threads take turns.
-
-        ``silent`` is the error about a sent request without an answer.
-        """
+        """Repeat a request until it is answered, once without again_s; threads take turns."""
         with self._turn:
             return self._exchange_alone(frames, answer_in, patience_s, again_s=again_s, silent=silent)
 

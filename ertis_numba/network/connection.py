@@ -16,12 +16,9 @@ _READ_OR_WRITE: Final = zmq.POLLIN | zmq.POLLOUT
 
 
 class Connection:
-    """Socket of a client with its monitor: sends, receives, pings, and reports refusals; for one thread.
+    """Socket of a client with its monitor: sends, receives, pings, and reports refusals; for one thread."""
 
-    ZeroMQ reconnects in the background. A client that has been refused, or hears nothing, makes a new connection.
-    Without ``keys``, it connects on loopback only. ``sent_s`` is that of the first message, which requires a peer; the
-    reader of valid messages sets ``heard_s``. `wait` of a connection that ``is_blocked`` ends when there is room.
-    """
+    # A client that has been refused, or hears nothing, makes a new connection. Without `keys`: loopback only.
 
     def __init__(
         self,

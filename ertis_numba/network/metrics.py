@@ -38,11 +38,9 @@ _NOW_OF_SENSOR: Final = {
 
 
 class Metrics:
-    """HTTP server of a central node's status as metrics, on this machine; refuses other Hosts with 421.
+    """HTTP server of a central node's status as metrics, on this machine; refuses other Hosts with 421."""
 
-    ``address`` is ``HOST:PORT``; port 0 selects a free one, which the attribute shows after the start. Other threads
-    call ``latest``.
-    """
+    # Port 0 of the address selects a free one, which `address` shows after the start.
 
     def __init__(self, address: str, latest: Callable[[], Status]) -> None:
         with extra("metrics", "metrics need prometheus-client"):

@@ -43,11 +43,8 @@ def private_folder(folder: Path) -> Path:
 
 
 def require_own(path: Path, about: str = "is an allow list of keys") -> None:
-    """Raise SettingsError for a file that users other than this one and root may change or replace.
-
-    The function follows each link of the path and checks each folder, as StrictModes of OpenSSH does for the folders
-    above ``authorized_keys``. It raises OSError if the file does not exist.
-    """
+    """Raise SettingsError for a file that users other than this one and root may change or replace."""
+    # It follows each link and checks each folder, as StrictModes of OpenSSH does. OSError if the file does not exist.
     if os.name != "posix":
         return
     folders, links, file = _way_to(path)

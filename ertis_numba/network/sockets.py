@@ -73,11 +73,8 @@ def server(
     max_bytes: int = MAX_BYTES,
     option: str = "--listen",
 ) -> "zmq.Socket[bytes]":
-    """Return a listening ROUTER; on loopback only without keys; raise NetworkError if the address is in use.
-
-    With keys, its context needs a `ZapAuthenticator` made before. ``max_bytes``, the longest frame, also bounds the
-    memory that an unauthenticated peer can occupy, so set no more than necessary. Users set the address by ``option``.
-    """
+    """Return a listening ROUTER; on loopback only without keys; raise NetworkError if the address is in use."""
+    # With keys, its context needs a `ZapAuthenticator`. `max_bytes` bounds the memory that an unknown peer can occupy.
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
     _allow_descriptors()
@@ -115,10 +112,8 @@ def bound(socket: "zmq.Socket[bytes]") -> str:
 def client(
     context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ClientKeys | None, max_bytes: int = MAX_BYTES
 ) -> "zmq.Socket[bytes]":
-    """Return a DEALER that reconnects, but not after a refusal, which a `Monitor` of it reports.
-
-    Without ``keys``, it connects on loopback only. Raises NetworkError if the address can never be connected to.
-    """
+    """Return a DEALER that reconnects, but not after a refusal, which a `Monitor` of it reports."""
+    # Without `keys`, it connects on loopback only. Raises NetworkError if the address can never be connected to.
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
     made = context.socket(zmq.DEALER)
@@ -155,10 +150,8 @@ def was_chosen(routing_id: bytes) -> bool:
 
 
 def monitor_event(frames: Sequence[bytes]) -> tuple[int, int]:
-    """Return event and value of a message from a monitor socket.
-
-    ``zmq.utils.monitor`` does the same, but importing it loads asyncio, which nothing else in these processes needs.
-    """
+    """Return event and value of a message from a monitor socket."""
+    # `zmq.utils.monitor` does the same, but loads asyncio.
     event, value = struct.unpack("=hi", frames[0])  # A 16-bit event and a 32-bit value, without padding.
     return event, value
 
@@ -182,10 +175,7 @@ class _Events:
 
 
 class Monitor(_Events):
-    """Monitor of a client's failed and interrupted connections: `read` its readable socket.
-
-    ``final`` is true if the client has given up: only a new socket tries again.
-    """
+    """Monitor of a client's failed and interrupted connections: `read` its readable socket."""
 
     def __init__(self, client: "zmq.Socket[bytes]") -> None:
         # `client` has made the monitor before it connected: a refusal may come at once.
@@ -219,11 +209,9 @@ class Monitor(_Events):
 
 
 class HandshakeMonitor(_Events):
-    """Counter of connections to a server that closed before the peer had presented a key.
+    """Counter of connections to a server that closed before the peer had presented a key."""
 
-    libzmq does not report which connection a finished handshake belongs to. A connection therefore counts only once the
-    open connections younger than the longest handshake can no longer account for the missing handshakes.
-    """
+    # libzmq does not report whose handshake finished: a connection counts once younger ones cannot account for it.
 
     def __init__(self, server: "zmq.Socket[bytes]") -> None:
         super().__init__(server, _server_monitor(server))

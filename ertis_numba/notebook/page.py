@@ -51,21 +51,8 @@ def page(
     notes: Sequence[str],
     draw: Callable[[Any], Any],
 ) -> str:
-    """Return HTML that needs no other file and no script.
-
-    Parameters
-    ----------
-    title : str
-        Title; a text.
-    axes : sequence of Axis
-        Arrays of the object.
-    listed : (html, text)
-        List of what the object contains, in HTML, and the text in its place if it is empty.
-    notes : sequence of str
-        Notes on the list; texts.
-    draw : callable
-        Draws the picture with the room `figures`, which imports Matplotlib; None if there is nothing to draw.
-    """
+    """Return HTML that needs no other file and no script."""
+    # `listed` is the content in HTML, and the text if it is empty. `draw` draws with the room `figures`, if anything.
     rows, missing = listed
     heads = [(name, "") for name in ("array", "axes", "shape", "type", "values", "meaning")]
     return "\n".join(

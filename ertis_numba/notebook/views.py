@@ -34,18 +34,8 @@ _TWO_DIGITS: Final = "two digits"
 
 @singledispatch
 def html_of(shown: Any) -> str:
-    """Return an object as HTML: a picture, axes with units, and its strongest reflectors or sources.
-
-    Parameters
-    ----------
-    shown : Energyscape, PointCloud, AcousticMap, RecordingReader or Settings
-        Object to show. Reflectors are those of ``ertis peaks``.
-
-    Raises
-    ------
-    TypeError
-        The object is of another type.
-    """
+    """Return an object as HTML: a picture, axes with units, and its strongest reflectors or sources."""
+    # Raises TypeError unless it is an Energyscape, PointCloud, AcousticMap, RecordingReader or Settings.
     raise TypeError(f"{type(shown).__name__} has no view; pass an image, points, a map, a recording or settings")
 
 

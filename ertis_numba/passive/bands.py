@@ -15,11 +15,8 @@ _ROUNDING = 1e-6  # relative, so that limits include the bands whose edges they 
 
 
 def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray[np.float64]:
-    """Return the edges in Hz of the octaves or thirds that lie between two frequencies: (band, 2).
-
-    Exact centres are ``1000 · G^(k / fraction)`` with ``G = 10^0.3``, and edges lie half of a band away (IEC
-    61260-1:2014, equations 2 and 4).
-    """
+    """Return the edges in Hz of the octaves or thirds that lie between two frequencies: (band, 2)."""
+    # Centres are `1000 · G^(k / fraction)` with `G = 10^0.3` (IEC 61260-1:2014, equations 2 and 4).
     step = 0.3 / fraction
     lowest = math.ceil((math.log10(low_hz / 1e3) - _ROUNDING) / step + 0.5)
     highest = math.floor((math.log10(high_hz / 1e3) + _ROUNDING) / step - 0.5)
@@ -28,10 +25,8 @@ def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray
 
 
 def band_edges(passive: Passive, recording: Recording) -> NDArray[np.float64]:
-    """Return edges (band, 2) of possible named bands, or of all listed ones; raise ArgumentError if one is too high.
-
-    Named bands beyond 0.8 of half of the recording's sample rate are left out.
-    """
+    """Return edges (band, 2) of possible named bands, or of all listed ones; raise ArgumentError if one is too high."""
+    # Named bands beyond 0.8 of half of the recording's sample rate are left out.
     given, highest_hz = passive.bands_hz, HIGHEST_SHARE * recording.sample_rate_hz / 2
     if isinstance(given, str):
         low_hz, high_hz = passive.limits_of(recording)

@@ -37,10 +37,7 @@ def block_length(n_samples: int) -> int:
 
 
 def block_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> str | None:
-    """Return a warning if sound crosses the array in more than half of a block; None if it does not.
-
-    Distant microphones then hear different parts of a sound in the same block, so that their spectra do not match.
-    """
+    """Return a warning if sound crosses the array in more than half of a block; None if it does not."""
     block_s, transit_s = 1 / spacing_of(settings, bands_hz), _transit_s(settings)
     if block_s >= _LEAST_TRANSITS * transit_s:
         return None

@@ -31,11 +31,9 @@ class Products(NamedTuple):
 
 
 class BlockSpectra:
-    """Sums of the products of spectra over the blocks of measurements.
+    """Sums of the products of spectra over the blocks of measurements."""
 
-    The needed bins are ``bins``, with the frequencies ``frequency_hz``; bin 1 has the frequency ``spacing_hz``. The
-    frequencies within bins are measured at the microphones ``channels``.
-    """
+    # Bin 1 has the frequency `spacing_hz`. Frequencies within bins are measured at the microphones `channels`.
 
     def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int) -> None:
         self._kernels, self._threads = kernels, threads
@@ -106,11 +104,8 @@ class BlockSpectra:
         return np.flatnonzero(intact)
 
     def _slopes(self, pieces: NDArray[np.float32]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-        """Return products of blocks (channel, block, sample) under the slope of the window, and powers.
-
-        With the window w, a tone has the spectrum X in a bin, and X′ with the slope of the window: -Im X′ / X is its
-        frequency relative to the centre of the bin.
-        """
+        """Return products of blocks (channel, block, sample) under the slope of the window, and powers."""
+        # A tone with the spectrum X, and X′ with the slope, has the frequency -Im X′ / X relative to the bin's centre.
         first, stop = int(self.bins[0]), int(self.bins[-1]) + 1
         own, slope = (
             np.ascontiguousarray(

@@ -11,12 +11,8 @@ __all__ = ["gathered", "strongest_first"]
 
 
 def gathered(found: AcousticMap) -> AcousticMap:
-    """Return a map of components, in which each source has one direction; other maps remain as they are.
-
-    The bins of a source between directions of the grid yield components in several of them. From the strongest
-    direction of a band on, the components of a direction and its neighbours are summed there. The power of a source in
-    the map is therefore its level, and the sum over all directions remains.
-    """
+    """Return a map of components, in which each source has one direction; other maps remain as they are."""
+    # From the strongest direction of a band on, the components of a direction and its neighbours are summed there.
     if not found.settings.passive.traits.is_sparse:
         return found
     neighbours = neighbours_of(unit_vectors(found.azimuth_rad, found.elevation_rad))

@@ -26,11 +26,8 @@ _OF_WIDTH: Final = 0.3  # Uncertain share of the power that the width of a bin c
 
 
 def powers_in_noise(beside: BandLikelihood, place: Floats, width: Floats | None = None) -> tuple[Floats, Floats]:
-    """Return the power of a source given all others, and the noise in each dimension, both (bin,).
-
-    Blocks of distant microphones hear slightly different sound, which changes the wave like a change of its frequency.
-    This is no noise of the microphones, if the width, (bin,) rad/s, of the frequencies in a bin is given.
-    """
+    """Return the power of a source given all others, and the noise in each dimension, both (bin,)."""
+    # Blocks of distant microphones hear slightly different sound, which is no noise if `width` (bin,) rad/s is given.
     powers, size = beside.beams(place[None])
     rest, n = beside.power - powers[:, 0], beside.dimensions - 1
     if width is not None and n > 1:
@@ -44,11 +41,8 @@ def powers_in_noise(beside: BandLikelihood, place: Floats, width: Floats | None 
 
 
 def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: HeardBand, *, level: bool) -> Floats:
-    """Return the covariance (2, 2) of direction k's errors sideways and upwards, infinite if not resolved.
-
-    The gradient of the likelihood has the variance of products of the beam with the noise outside of it. Sources that
-    are not separated leave more power in the changes of the wave than this noise, which shows how far they are apart.
-    """
+    """Return the covariance (2, 2) of direction k's errors sideways and upwards, infinite if not resolved."""
+    # The gradient of the likelihood has the variance of products of the beam with the noise outside of it.
     place, beside = places[k], beside_others(likelihood, places, k, band)
     powers, noise = powers_in_noise(beside, place, band.width)
     powers, (_, changes, size) = np.maximum(powers, 0), beside.slopes(place)

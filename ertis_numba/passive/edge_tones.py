@@ -36,12 +36,9 @@ class _Tone(NamedTuple):
 
 
 class EdgeTones:
-    """Spectra at the edges of bands, at the microphones and in the loudest directions of the bands, over all maps.
+    """Spectra at the edges of bands, at the microphones and in the loudest directions of the bands, over all maps."""
 
-    Directions show a tone that is weaker than noise at the microphones. Beams of grids coarser than the main lobe
-    distort its spectrum, so that of the microphones has priority if it shows the tone. Powers of methods that are not
-    linear do not follow the window: their tones are found at the microphones only.
-    """
+    # Directions show weaker tones, but beams of coarse grids distort the spectrum, so that microphones have priority.
 
     def __init__(self, band_hz: Floats, frequency_hz: Floats, highest_hz: float, *, is_linear: bool) -> None:
         self._band_hz, self._frequency_hz, self._highest_hz = band_hz, frequency_hz, highest_hz
@@ -71,10 +68,7 @@ class EdgeTones:
         self._count += count
 
     def note(self, *, within: bool = False) -> str | None:
-        """Return a note on the loudest tone of whose power a band shows only a part; None without any.
-
-        ``within`` leaves out tones at edges of one band only, beyond which other sound is louder.
-        """
+        """Return a note on the loudest tone of whose power a band shows only a part; None without any."""
         tones = [
             (edge, tone)
             for number, edge in enumerate(self._edges)

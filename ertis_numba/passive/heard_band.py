@@ -22,11 +22,9 @@ _CERTAIN: Final = 2.0  # Power of a source relative to its deviation in noise th
 
 
 class HeardBand(NamedTuple):
-    """Spectrum of the sound of a band.
+    """Spectrum of the sound of a band."""
 
-    A bin contains sound of other bins, which the window spreads, and sound off its centre. The phases of its wave are
-    those of the mean frequency of the sound. Bins whose sound is beyond the band are left out.
-    """
+    # The phases of a wave are those of the mean frequency of the sound. Bins with sound beyond the band are left out.
 
     matrix: NDArray[np.complex128]  # (bin, mic, mic) with a mean power of 1
     level: Floats  # (bin,) mean power
@@ -79,10 +77,7 @@ class HeardBand(NamedTuple):
 
 
 class _Frequencies(NamedTuple):
-    """Moments of the frequencies of sources relative to the bins, powers, noise: (bin, source); and the rest.
-
-    The powers are without noise, which is that of their estimates in one block.
-    """
+    """Moments of the frequencies of sources relative to the bins, powers, noise: (bin, source); and the rest."""
 
     moments_hz: Floats
     powers: Floats

@@ -1,7 +1,4 @@
-"""High-resolution CLEAN-SC: separation of sources that lie within one main lobe.
-
-Batches of bins are processed together, because the kernel of the camera steers many matrices at once.
-"""
+"""High-resolution CLEAN-SC: separation of sources that lie within one main lobe."""
 
 from typing import Any, Final, NamedTuple
 

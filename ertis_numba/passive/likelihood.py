@@ -127,10 +127,7 @@ class BandLikelihood:
     def waves(
         self, directions: Floats, omega: Floats | None = None, *, order: int = 0, curved: bool = False, part: int = 1
     ) -> NDArray[np.complex128]:
-        """Return whitened waves, or derivatives by angular frequency or 1/range: (bin, mode, direction).
-
-        Those by 1/range are a part of `WaveDelays.curvatures`.
-        """
+        """Return whitened waves, or derivatives by angular frequency or 1/range: (bin, mode, direction)."""
         waves = self.unwhitened_waves(directions, omega, order=0 if curved else order)
         if curved:
             curvatures = (
@@ -166,11 +163,9 @@ class BandLikelihood:
         return waves
 
     def separated(self, directions: Floats, omega: Floats | None = None) -> tuple[Floats, Floats]:
-        """Return powers (bin, source) without noise, each outside of others, and noise per dimension (bin,).
-
-        Each row of the pseudoinverse of the waves is orthogonal to the waves of the other sources. ``directions`` has
-        all sources: this likelihood must have no others.
-        """
+        """Return powers (bin, source) without noise, each outside of others, and noise per dimension (bin,)."""
+        # Each row of the pseudoinverse of the waves is orthogonal to other sources. This likelihood must have no
+        # others.
         waves = self.waves(directions, omega)
         products = waves.conj().transpose(0, 2, 1) @ waves
         inverse = np.linalg.inv(products + _SINGULAR * waves.shape[1] * np.eye(len(directions)))

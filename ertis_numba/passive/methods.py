@@ -36,10 +36,8 @@ _MIN_BINS: Final = 8  # Matrices of fewer bins take less time than the start of 
 
 
 def in_parts(function: Callable[..., NDArray[Number]], *of_bins: NDArray[Any], threads: int) -> NDArray[Number]:
-    """Return the rows of a function of bins, called once per thread with a part of each array.
-
-    NumPy computes linear algebra without holding the lock of the interpreter, so the parts run in parallel.
-    """
+    """Return the rows of a function of bins, called once per thread with a part of each array."""
+    # NumPy computes linear algebra without holding the lock of the interpreter.
     n_bins = len(of_bins[0])
     count = max(1, min(threads, n_bins // _MIN_BINS))
     if count == 1:
@@ -108,10 +106,7 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
 
 
 def _powers_outside(vectors: Vectors, waves: Waves) -> Powers:
-    """Return the power of each wave outside the subspace that orthonormal vectors span: (bin, direction).
-
-    Where little power is left, the difference is computed in double precision.
-    """
+    """Return the power of each wave outside the subspace that orthonormal vectors span: (bin, direction)."""
     n_mics = vectors.shape[2]
     powers: Powers = n_mics - waves.steer_vectors(vectors.astype(np.complex64))
     for k in np.flatnonzero(powers.min(axis=1) < _CANCELLED * n_mics):

@@ -56,10 +56,7 @@ class NoiseModel:
         weights: NDArray[np.float64],
         sources: NDArray[np.complex128] | None = None,
     ) -> float:
-        """Return the most likely share of the diffuse field, 0 to 1, outside of sources (bin, mic, n).
-
-        The weights (bin,) are numbers of samples.
-        """
+        """Return the most likely share of the diffuse field, 0 to 1, outside of sources (bin, mic, n)."""
         modes: NDArray[np.complex128] = self._modes.astype(np.complex128)
         if sources is not None and sources.shape[2]:
             basis = np.linalg.qr(sources)[0]
@@ -87,23 +84,17 @@ class NoiseModel:
 
 
 class NoiseFluctuations(NamedTuple):
-    """Fluctuations of the power that beams hear in the noise of a band.
+    """Fluctuations of the power that beams hear in the noise of a band."""
 
-    Products of different microphones have random phases in noise, so the sum of their squares is the variance of this
-    power. In noise of a part of the band, of a short time, or in tones of random phases, it is larger than in white
-    noise, as if there were fewer samples.
-    """
+    # In noise of a part of the band or of a short time, and in tones, it is larger, as if there were fewer samples.
 
     n_samples: float  # of white noise with the same variance
     values: Floats  # eigenvalues of the mean matrix, with mean 1; empty as in white noise
 
     @classmethod
     def of(cls, matrix: Matrices, outside: Matrices, wave: Matrices, weights: Floats, of_white: float) -> Self:
-        """Return fluctuations outside of sources; of_white is the number of samples in white noise.
-
-        ``outside`` (bin, mic, mic) projects outside of the sources, ``wave`` (bin, mic, 1) is that of the beam, and the
-        weights (bin,) have a sum of 1.
-        """
+        """Return fluctuations outside of sources; of_white is the number of samples in white noise."""
+        # `outside` (bin, mic, mic) projects outside of the sources, and `wave` (bin, mic, 1) is that of the beam.
         n_mics, none = matrix.shape[1], np.zeros(0)
         n = round(float(np.trace(outside[0]).real))
         if n < 2:

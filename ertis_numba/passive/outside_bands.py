@@ -23,13 +23,10 @@ _BESIDE: Final = 2  # Bins on each side into which the window spreads a tone.
 
 
 class OutsideBands:
-    """Spectrum of the sound in measurements with PCM, compared with bands.
+    """Spectrum of the sound in measurements with PCM, compared with bands."""
 
-    Its mean over time is taken in up to four microphones, without their offsets. Sound outside of the bands is worth a
-    note if its power per hertz, or its loudest bin, exceeds that inside by 3 dB. White noise never does. One-bit
-    microphones have noise of their own beyond the bands, so that PDM yields no note; neither do bands and limits of
-    your own, and measurements with a call.
-    """
+    # A note is worth 3 dB more power per hertz, or in the loudest bin, outside. One-bit microphones, own bands and
+    # measurements with a call yield none.
 
     def __init__(self, settings: Settings, bands_hz: NDArray[np.float64]) -> None:
         self._recording = recording = settings.recording

@@ -28,11 +28,8 @@ _MOST_SEARCHED: Final = 30_000  # Directions beyond which fine ones within limit
 
 
 def coarse_map_warning(settings: Settings, grid: DegreesFromRadians | None = None) -> str | None:
-    """Return a warning if sources between directions of maps are too weak, or weaker than side lobes.
-
-    None if a source anywhere between the directions of the settings or of a grid or result loses at most 3 dB in all
-    bands, and exceeds the side lobes. The warning names a grid that suffices, or frequencies that the grid resolves.
-    """
+    """Return a warning if sources between directions of maps are too weak, or weaker than side lobes."""
+    # They may lose 3 dB in all bands. The warning names a grid that suffices, or frequencies that the grid resolves.
     check = GridCheck(direction_grid(settings.processing) if grid is None else grid, settings.processing)
     found = (block_warning(settings, heard_bands(settings)), None if check.is_single else _map_warning(settings, check))
     return "; also, ".join(filter(None, found)) or None
@@ -86,12 +83,8 @@ def _coarse(
 
 
 def search_changes(settings: Settings) -> dict[str, object]:
-    """Return the changes of settings with which directions suit the search for bearings; empty if none.
-
-    They are a grid over all directions, or for an array without extent along x over the half-space ahead; for an array
-    on a horizontal line, a grid in one plane. Fine directions within narrower limits are kept if this grid has over
-    30,000.
-    """
+    """Return the changes of settings with which directions suit the search for bearings; empty if none."""
+    # They are a grid over all directions, or the half-space or plane that the array resolves.
     processing, limits = settings.processing, _all_directions(settings)
     contains_all = all(
         min(getattr(processing, name)) <= low and high <= max(getattr(processing, name))
@@ -116,11 +109,8 @@ def _all_directions(settings: Settings) -> dict[str, tuple[float, float]]:
 
 
 def search_warning(settings: Settings) -> str | None:
-    """Return a warning if sources between or beside the directions yield wrong bearings, or none.
-
-    Bearings and their levels are refined beyond the grid, so a source in the middle between directions may lose 6 dB.
-    An array that is not a horizontal line resolves elevations, so its directions need several.
-    """
+    """Return a warning if sources between or beside the directions yield wrong bearings, or none."""
+    # A source in the middle between directions may lose 6 dB, because bearings are refined beyond the grid.
     check, lobe_at = GridCheck(direction_grid(settings.processing), settings.processing), _lobes(settings, np.asarray)
     ambiguity = None if check.is_single else _ambiguity(_bands_hz(settings), check, lobe_at)
     found = (block_warning(settings, heard_bands(settings)), _search_warning(settings), ambiguity)

@@ -38,10 +38,9 @@ _TINY: Final = 1e-300
 
 
 class _Top(NamedTuple):
-    """Source of a band, with its direction as a unit vector, (axis,) float64, and the width of its cell.
+    """Source of a band, with its direction as a unit vector, (axis,) float64, and the width of its cell."""
 
-    The width is 0 if the direction is interpolated, and infinite if the source may lie beyond an edge of the grid.
-    """
+    # The width is 0 if the direction is interpolated, and infinite if the source may lie beyond an edge.
 
     direction: Floats
     power: float
@@ -200,10 +199,7 @@ def _patterns(settings: Settings, grid: bytes, low_hz: float, high_hz: float) ->
 
 
 def _of_doubtful_direction(tops: list[_Top], *, is_beyond: bool) -> list[_Top]:
-    """Return sources with an infinite width from the first one on that may lie beyond the grid.
-
-    Weaker sources may be remains or side lobes of that one.
-    """
+    """Return sources with an infinite width from the first one on that may lie beyond the grid."""
     out, is_doubtful = [], is_beyond
     for each in tops:
         is_doubtful |= math.isinf(each.width_rad)
@@ -214,10 +210,7 @@ def _of_doubtful_direction(tops: list[_Top], *, is_beyond: bool) -> list[_Top]:
 def _without_side_lobes(
     tops: list[_Top], delays: WaveDelays, band_hz: Floats, *, top: int, outside: OutsideSource | None
 ) -> list[_Top]:
-    """Return the maxima that exceed the side lobes of the stronger ones, up to a number, the strongest first.
-
-    The strongest maximum is always kept. Side lobes of a source outside of the grid count.
-    """
+    """Return the maxima that exceed the side lobes of the stronger ones, up to a number, the strongest first."""
     delay_s = delays(np.array([each.direction for each in tops]))
     omega = _omega(band_hz)
     kept: list[int] = []

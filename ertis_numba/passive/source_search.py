@@ -60,11 +60,9 @@ class FoundSource(NamedTuple):
 
 
 class BandSearch:
-    """Search for the sources of one band, in bins of which shares lie within the band.
+    """Search for the sources of one band, in bins of which shares lie within the band."""
 
-    ``delays`` returns the delays of the sound from unit vectors, (direction, mic), and ``steer`` the power of matrices,
-    (bin, mic, mic), for the wave from each direction of the scan.
-    """
+    # `delays` returns those from unit vectors, (direction, mic), and `steer` the power of matrices (bin, mic, mic).
 
     def __init__(
         self,
@@ -126,10 +124,7 @@ class BandSearch:
         return [source for source in sources if source.power >= least * strongest]
 
     def _is_possible(self, likelihood: BandLikelihood, places: Floats, band: HeardBand, *, least: float) -> bool:
-        """Return False if corrected sources lie too close together to be separated, or exceed the sound of the band.
-
-        The last of them, which is new, must also have its least power.
-        """
+        """Return False if corrected sources lie too close together to be separated, or exceed the sound of the band."""
         for k, place in enumerate(places):
             beside = beside_others(likelihood, places, k, band)
             size, whole = (band.weights @ each.beams(place[None])[1] for each in (beside, beside.beside(_NONE)))
@@ -201,10 +196,7 @@ class BandSearch:
         return exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
 
     def _of_noise(self, share: float) -> tuple[ScanExtent, Floats]:
-        """Return the extent of the scan, and the similarity of the beams of neighbouring bins.
-
-        Both are those of noise with a diffuse share, at the mean square frequency of the band.
-        """
+        """Return the extent of the scan, and the similarity of the beams of neighbouring bins."""
         step = round(-_SHARE_STEPS * math.log10(1 - share))
         if step not in self._laws:
             omega = math.sqrt(float(self._weights @ self._omega**2))
@@ -237,10 +229,7 @@ class BandSearch:
         return places
 
     def _loudest(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
-        """Return directions of the scan with the largest mean power relative to the noise, apart from each other.
-
-        The highest maximum in noise may lie between weaker directions of the scan than another one.
-        """
+        """Return directions of the scan with the largest mean power relative to the noise, apart from each other."""
         every: Floats | NDArray[np.float32] = np.full((len(self._omega), 1), float(whole.dimensions))
         if whole.is_whitened:
             every = self._powers_of(whole, whole.projection)
@@ -271,11 +260,7 @@ class BandSearch:
         return FoundSource(places[k], max(0.0, power), max(0.0, ratio), covariance, may_be_crosstalk)
 
     def _chance_of_phases(self, places: Floats, k: int, certain: list[int], band: HeardBand) -> float:
-        """Return the probability that the sound of a source, with random phases, fits a direction as well as it does.
-
-        The fit is that of its loudest bin. Sound beside louder sources, which are certain, and outside of the direction
-        is a misfit: it may belong to these phases, unless noise explains it. So is what noise may hide.
-        """
+        """Return the probability that the sound of a source, with random phases, fits a direction as well."""
         plain = BandLikelihood(
             band.matrix, None, band.omega, band.weights, self._delays, curvatures=self._delays.curvatures
         )

@@ -302,10 +302,7 @@ class _Correlator:
 
 
 def _distortion(row: NDArray[np.float32]) -> float:
-    """Return the error in samples by the harmonics of a coarse or limited signal, which may be aliased.
-
-    Steps of a sixth of its standard deviation or less have no effect.
-    """
+    """Return the error in samples by the harmonics of a coarse or limited signal, which may be aliased."""
     values = np.unique(row)
     if len(values) < 2:
         return 0.0

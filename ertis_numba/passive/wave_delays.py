@@ -34,10 +34,7 @@ class WaveDelays:
         return np.asarray(delay_s + self._own_s)
 
     def curvatures(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the changes of delays by 1/range, in s m, for sources at a finite range: (2, direction, mic).
-
-        The second have no part that another direction has as well. Both are 0 with passive.focus_m.
-        """
+        """Return the changes of delays by 1/range, in s m, for sources at a finite range: (2, direction, mic)."""
         out = np.zeros((2, len(directions), len(self._own_s)))
         if self._focus_m is None:
             for k, direction in enumerate(directions):

@@ -112,11 +112,8 @@ class Prediction:
 
 
 def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet, *, threads: int) -> Planner:
-    """Return a planner with the signal model of a measurement, and with its sensitivity for adaptive beamformers.
-
-    The sensitivity is the ratio of two error powers. One is that of the image, measured in a sample of the directions.
-    The other is predicted for the delay-and-sum beams of the same signals.
-    """
+    """Return a planner with the signal model of a measurement, and with its sensitivity for adaptive beamformers."""
+    # The sensitivity is the measured error power of a sample / that predicted for delay-and-sum beams.
     settings = image.settings
     adaptive = settings.processing.is_adaptive
     amplitude = None if adaptive else image.amplitude
@@ -137,10 +134,7 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
 
 
 def predict(planner: Planner, image: Energyscape | None = None) -> Prediction:
-    """Return a planner's prediction for its complete plan, with the budget.
-
-    If the budget is exceeded, echoes are searched in ``image``: errors relative to an image of noise alone are large.
-    """
+    """Return a planner's prediction for its complete plan, with the budget."""
     settings = planner.settings
     processing = settings.processing
     uncertainty_db = ADAPTIVE_UNCERTAINTY_DB
@@ -184,10 +178,9 @@ def memory_bytes(image: Energyscape) -> int:
 
 
 class BudgetMonitor:
-    """Prediction for the first image, and for each that is 10 dB fainter than all predicted before; thread-safe.
+    """Prediction for the first image, and for each that is 10 dB fainter than all predicted before; thread-safe."""
 
-    Relative errors grow as images become fainter. ``prediction`` is None before the first image that is not silent.
-    """
+    # Relative errors grow as images become fainter. `prediction` is None before the first image that is not silent.
 
     def __init__(self, kernels: KernelSet, threads: int) -> None:
         self._kernels, self._threads = kernels, threads

@@ -27,13 +27,10 @@ _WATCH_INTERVAL_S: Final = 0.1
 
 
 class Child(Generic[Kind]):
-    """Python process that runs a module of this package, which calls `connect` and sends messages of ``kinds``.
+    """Python process that runs a module of this package, which calls `connect` and sends messages of ``kinds``."""
 
-    It is a new interpreter rather than a fork, which OpenMP, HDF5 and ZeroMQ would not survive. Unlike a process of
-    `multiprocessing`, it does not import the main program. It has a session of its own, so that Ctrl-C in a terminal
-    does not reach it. ``keep_stderr`` keeps the last line of its stderr for `wait`, instead of sharing that of this
-    process.
-    """
+    # It is no fork, which OpenMP, HDF5 and ZeroMQ would not survive, and has a session of its own: Ctrl-C does not
+    # reach it. `keep_stderr` keeps the last line of its stderr for `wait`.
 
     def __init__(
         self, module: str, kinds: Any, environment: Mapping[str, str] | None = None, *, keep_stderr: bool = False
@@ -127,12 +124,9 @@ def is_child() -> bool:
 def connect(
     kinds: Any, *, outlives_parent: bool = False, on_parent_end: Callable[[], None] = lambda: None
 ) -> "Pipe[Any]":
-    """Return the pipe to the parent process, in a process that `Child` has started.
-
-    With ``outlives_parent``, this process continues when the parent has ended or has closed the pipe, and accepts its
-    interrupts. By default, it ends with the parent even if that is killed, and ignores signals that ask it to end;
-    ``on_parent_end`` is called in a thread before that.
-    """
+    """Return the pipe to the parent process, in a process that `Child` has started."""
+    # By default, this process ends with the parent, after `on_parent_end`, and ignores signals that ask it to end. With
+    # `outlives_parent`, it continues.
     # Registered first, so it runs after all other exit handlers. Without it, Python's last garbage collection scans all
     # modules, which takes 0.1 to 0.3 s.
     atexit.register(gc.freeze)

@@ -41,11 +41,9 @@ class RemoteError:
 
 
 class WorkerActor:
-    """Actor in a dask worker, which its client calls directly, without the scheduler.
+    """Actor in a dask worker, which its client calls directly, without the scheduler."""
 
-    An ordinary task needs a decision of the scheduler and two of its batches each way, and its arguments are serialised
-    twice more.
-    """
+    # An ordinary task needs a decision of the scheduler and two of its batches each way.
 
     async def call(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Call a function in its own thread and return its result, or `RemoteError` if it fails."""
@@ -117,11 +115,8 @@ class WorkerActors:
         self._pending: dict[str, tuple[Future, Future]] = {}
 
     def connected(self, addresses: Collection[str], *, timeout_s: float) -> dict[str, tuple[Any, int]]:
-        """Return a new `WorkerActor` in each worker that answers within the timeout, and the number of its process.
-
-        Workers that do not answer yet are waited for in the next call, if it names them again. A dead worker, unknown
-        to the scheduler, therefore delays the others by no more than the timeout.
-        """
+        """Return a new `WorkerActor` in each worker that answers within the timeout, and the number of its process."""
+        # A later call waits for the others, so that a dead worker delays them by no more than the timeout.
         import distributed  # noqa: PLC0415  it is installed, since a client exists
 
         wait: Any = distributed.wait

@@ -153,10 +153,8 @@ def wait_for(pipes: Iterable[Pipe[Any]], timeout_s: float | None) -> list[Pipe[A
 
 
 def anonymous_memory(n_bytes: int) -> int:
-    """Return the descriptor of new memory that processes can share, and that the system frees with the last of them.
-
-    Memory of `multiprocessing.shared_memory` has a name, by which it is left behind if every process is killed at once.
-    """
+    """Return the descriptor of new memory that processes can share, and that the system frees with the last of them."""
+    # Memory with a name, as of `multiprocessing.shared_memory`, is left behind if every process is killed at once.
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create("ertis")
     else:

@@ -12,11 +12,10 @@ Kind = TypeVar("Kind")
 
 
 class SupervisedProcess(Generic[Kind]):
-    """Child that is killed when it misses a deadline, and that is replaced when it has ended.
+    """Child that is killed when it misses a deadline, and that is replaced when it has ended."""
 
-    No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second. ``delays_s`` are
-    the delays before it is replaced, by the number of earlier ends since the last `succeeded`; the last one repeats.
-    """
+    # No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second. `delays_s`
+    # precede its replacement, by the number of earlier ends since the last `succeeded`.
 
     def __init__(
         self, module: str, kinds: Any, delays_s: Sequence[float], environment: Mapping[str, str] | None = None

@@ -51,11 +51,8 @@ class FusedImages:
         self._n_fused, self._unshown = 0, frozenset[str]()
 
     def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[PulseImages]:
-        """Add an image; return the pulses that are complete now, with an origin in whole metres, as `joined`.
-
-        Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
-        be fused is left out with a note. ``mountings`` are those of all sensors with a known pose.
-        """
+        """Add an image; return the pulses that are complete now, with an origin in whole metres, as `joined`."""
+        # A pulse that cannot be fused is left out with a note.
         fused = []
         for group in self._groups.add(image):
             try:
@@ -110,11 +107,8 @@ class FusedImages:
 
 
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
-    """Return the points of several mounted sensors in the frame of the platform, with the earliest time.
-
-    If a sensor is more than 1 km from the origin of this frame, the points are in the frame ``base_link_local``, and
-    ``translation_m`` is its origin in whole kilometres.
-    """
+    """Return the points of several mounted sensors in the frame of the platform, with the earliest time."""
+    # Sensors more than 1 km away have the frame `base_link_local`, whose `translation_m` is in whole kilometres.
     each = list(clouds.values())
     stamp = min((cloud.stamp for cloud in each), key=lambda stamp: stamp.timestamp_ns)
     uncertainty_m = [

@@ -19,11 +19,9 @@ _Group = dict[str, _Item]
 
 
 class OdometryPublisher:
-    """Publisher of nav_msgs/msg/Odometry and the transform from ``odom`` to ``base_link``.
+    """Publisher of nav_msgs/msg/Odometry and the transform from ``odom`` to ``base_link``."""
 
-    Any thread calls ``on_note`` with a line for each sensor without mounting, and each unusable pulse. While
-    ``is_paused`` returns True, the pose is computed but not published. ``alone`` is as for `Odometry`.
-    """
+    # While `is_paused` returns True, the pose is computed but not published. `alone` is as for `Odometry`.
 
     def __init__(
         self,

@@ -186,11 +186,8 @@ def _domain_id(given: int | None) -> int:
 
 
 def _configuration(interface: str) -> str:
-    """Return the configuration of Cyclone DDS.
-
-    Fast DDS announces types in a form that Cyclone DDS rejects, so it is ignored (vendor 1.15). Large messages of
-    several topics may be on their way at the same time.
-    """
+    """Return the configuration of Cyclone DDS."""
+    # Fast DDS announces types in a form that Cyclone DDS rejects, so it is ignored (vendor 1.15).
     return (
         "<CycloneDDS><Domain><General>"
         f'<Interfaces><NetworkInterface name="{interface}"/></Interfaces><AllowMulticast>true</AllowMulticast>'

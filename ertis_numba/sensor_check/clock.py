@@ -70,12 +70,8 @@ class _Run:
 
 
 def check_clock(stamps: Sequence[Stamp], duration_s: float, nominal_rate_hz: float | None = None) -> ClockCheck:
-    """Compare the pulse counters of one sensor with its time stamps, and with the duration of a measurement.
-
-    The counter belongs to the sensor, or to its SYNC chain, and the time stamps to the host. A line through counters
-    and times is fitted by least squares, with one offset for each session. Late time stamps are left out. The drift is
-    unknown without the nominal rate.
-    """
+    """Compare the pulse counters of one sensor with its time stamps, and with the duration of a measurement."""
+    # A line with one offset for each session is fitted by least squares; late time stamps are left out.
     if not stamps or not all(stamp.is_timed for stamp in stamps):
         return _unknown("the time stamps are not from a clock, as in simulations and imports")
     runs = [run for run in _runs(stamps) if len(run.count) > 1]
@@ -139,10 +135,7 @@ def _runs(stamps: Sequence[Stamp]) -> list[_Run]:
 
 
 def _miscounts(extra: NDArray[np.float64], at: NDArray[np.int64]) -> list[tuple[str, str]]:
-    """Return a fault for the first interval that differs from its count by whole periods, and stays so.
-
-    A late time stamp makes one interval longer and the next one shorter, which is not a fault.
-    """
+    """Return a fault for the first interval that differs from its count by whole periods, and stays so."""
     whole = np.rint(extra)
     jumps = np.flatnonzero((whole != 0) & (np.abs(extra - whole) < _NEAR))
     for place in jumps:

@@ -22,12 +22,8 @@ _MAX_RANGE_DECIMATION = 10_000
 
 
 def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Processing:
-    """Return processing with ranges that suit a record and its call.
-
-    A default range window is shortened so that whole echoes fit into the record in any air. A ``range_decimation`` that
-    gives fewer than 1.8 ranges per second and hertz of bandwidth is reduced. With the default spacing of 3.8 mm, a
-    pulse of 60 kHz bandwidth could lie between two ranges and lose 2 dB.
-    """
+    """Return processing with ranges that suit a record and its call."""
+    # A default window is shortened to whole echoes, and a `range_decimation` that could lose 2 dB is reduced.
     if recording.duration_s <= call.end_s:
         raise ArgumentError(
             f"recording.n_samples gives a record of {1e3 * recording.duration_s:.4g} ms, but the call ends after "

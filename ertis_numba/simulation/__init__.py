@@ -1,7 +1,6 @@
 """Scenes with known ground truth, and their rendering to raw samples.
 
-Import `render` and `Simulator` from ``ertis_numba.simulation.render``. That module loads the compiled kernels, and
-the description of a scene does not need them.
+Import `render` and `Simulator` from ``ertis_numba.simulation.render``, which loads the compiled kernels.
 """
 
 from ertis_numba.simulation.platform import Platform

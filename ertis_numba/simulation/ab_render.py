@@ -29,11 +29,9 @@ _KEPT_BYTES = 2**28  # total size of the stored images; for large grids it allow
 
 
 class ABRender:
-    """Renders and processes measurements of a scene with two different sets of effects.
+    """Renders and processes measurements of a scene with two different sets of effects."""
 
-    Modulators and converters are left out unless a signal comes within 6 dB of full scale, because any change of their
-    input changes their noise, which does not count as a changed image.
-    """
+    # Modulators and converters, whose noise any change affects, are left out below 6 dB of full scale.
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -100,13 +98,9 @@ def image_change_db(
     floor: float,
     noise: Image | float = 0.0,
 ) -> float:
-    """Return the greatest difference of two images (direction, range) in decibels.
-
-    The difference at each point, less that of ``noise`` alone, is ``20 log10(1 + |Δ| / reference)``. The reference is
-    the strongest amplitude that both images have over all directions and 5 cm of range, but at least ``floor``, that of
-    the weakest reflector to be preserved. A change that is masked by side lobes of a stronger echo therefore hardly
-    counts.
-    """
+    """Return the greatest difference of two images (direction, range) in decibels."""
+    # It is `20 log10(1 + |Δ| / reference)` less that of `noise`. The reference is the strongest amplitude that both
+    # images have over all directions and 5 cm of range, but at least `floor`.
     beside = np.maximum(_local(np.minimum(before, after), spacing_m), floor)
     change = np.maximum(np.abs(after - before) - noise, 0.0)
     return float(20 * np.log10(1 + np.max(change / beside, initial=0.0)))

@@ -215,11 +215,8 @@ def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch | None 
 
 
 def _strength(paths: Paths, *, spreads: bool) -> Floats:
-    """Return the reflected amplitude of each target: (path,).
-
-    In the far field a sphere acts as a point whose strength is half of the radius. The spreading law of spheres already
-    includes this factor.
-    """
+    """Return the reflected amplitude of each target: (path,)."""
+    # A sphere acts as a point of half of its radius in the far field; its spreading includes this factor.
     targets = paths.targets
     if not len(targets):
         return np.ones(len(paths))
@@ -235,11 +232,8 @@ def arrived(
     amplitude: Floats | Complexes,
     stretch: Floats | None = None,
 ) -> Arrivals:
-    """Return copies of the call of sensor ``number``, timed by the clock of the receiving sensor.
-
-    Copies that end before the record begins are left out; clocks that differ can cause them. ``delay_s`` and
-    ``stretch`` are (path, mic), and ``amplitude`` (path, mic, frequency).
-    """
+    """Return copies of the call of sensor ``number``, timed by the clock of the receiving sensor."""
+    # `delay_s` and `stretch` are (path, mic), and `amplitude` (path, mic, frequency).
     sensor = shot.scene.sensors[number]
     for _, act in acting("clock_times", active):
         delay_s, stretch = act(shot, number, delay_s, stretch)

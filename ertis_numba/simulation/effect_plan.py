@@ -41,13 +41,10 @@ _MAX_FREQUENCIES = 64
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Decision about one effect.
+    """Decision about one effect."""
 
-    ``estimate_db`` is None if the effect cannot be left out or applies to nothing in the scene. ``forced`` by the
-    scene: by ``effects``, by a key that requests the effect, or by a tolerance of 0. ``ab_rendered``: the estimate was
-    too close to the tolerance. ``coupled``: the decisions about this and another effect depend on each other; both are
-    then on.
-    """
+    # `forced` by the scene; `ab_rendered`, because the estimate was close to the tolerance; `coupled` with another
+    # effect. `estimate_db` is None if the effect cannot be left out or does not apply.
 
     name: str
     on: bool
@@ -236,12 +233,8 @@ def _active(verdicts: dict[str, Verdict]) -> frozenset[str]:
 
 
 def change_of_sources(name: str, shot: Snapshot, active: frozenset[str]) -> Estimate | None:
-    """Return the greatest change by an effect of any source's sound at the array centre; None if there is none.
-
-    The change is ``20 log10(1 + |after - before| / level)``, where the level is the higher of both. Amplitudes of paths
-    are compared one by one; a delay that changes during the record turns their phases. Sound below the resolution of
-    recordings does not count.
-    """
+    """Return the greatest change by an effect of any source's sound at the array centre; None if there is none."""
+    # It is `20 log10(1 + |after - before| / level)`, path by path, where the level is the higher of both.
     scene = shot.scene
     if name not in _ON_SOURCES or scene.effects.get("interference") is False or not EFFECTS[name].may_apply(scene):
         return None

@@ -222,12 +222,8 @@ class Sight:
     def of_white_noise(
         self, dbfs: float, *, coherent: bool = False, band: tuple[Floats, Floats] | None = None
     ) -> float:
-        """Return the highest amplitude that white noise, or noise with a spectrum, reaches in the image.
-
-        ``dbfs`` is the RMS over the whole band up to half of the sample rate, or over ``band``: equally spaced
-        frequencies, and the power at each on an arbitrary scale. ``coherent`` noise comes from one place, and beams do
-        not reduce it.
-        """
+        """Return the highest amplitude that white noise, or noise with a spectrum, reaches in the image."""
+        # `dbfs` is the RMS over the whole band or `band`, frequencies and powers. `coherent` noise is from one place.
         matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
         half_hz = self.settings.recording.sample_rate_hz / 2
@@ -294,12 +290,8 @@ class Sight:
         turn_s: Floats | None = None,
         aside: Floats | float = 0.0,
     ) -> tuple[int, float]:
-        """Return the path that changes most relative to the image ``around`` it, and the ratio.
-
-        The envelope of each path changes. Where a path overlaps the side lobes of others, the phase of its carrier also
-        matters: it is shifted by ``turn_s`` (path,), by default the change of the delay. ``reach`` is as in `reach`,
-        and ``aside`` are other changes.
-        """
+        """Return the path that changes most relative to the image ``around`` it, and the ratio."""
+        # Its envelope changes, and its carrier by `turn_s` (path,). `reach` is as in `reach`; `aside`: other changes.
         shift_s = after.delay_s - before.delay_s
         turn_s = np.abs(shift_s) if turn_s is None else turn_s
         centre_hz = float(self.frequency_hz @ self.power)

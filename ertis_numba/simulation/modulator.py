@@ -20,12 +20,9 @@ _GAIN_STEP = 2.0**-20  # gains are rounded, so that differences between processo
 
 
 class Modulator:
-    """One modulator per enabled microphone; its state carries over from block to block.
+    """One modulator per enabled microphone; its state carries over from block to block."""
 
-    ``dither`` is the width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones. Values above
-    0.5 reduce the dynamic range. ``order`` is 1 to 4; ``band`` is the upper edge in which noise is minimised, in cycles
-    per sample. ``noise_rms`` 0 adds none and takes no time.
-    """
+    # `dither` is the width at the quantiser, `order` 1 to 4, and `band` the edge of low noise in cycles per sample.
 
     def __init__(
         self,
@@ -50,11 +47,9 @@ class Modulator:
         self._threads = self._kernels.max_threads if threads is None else threads
 
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.unsignedinteger]) -> None:
-        """Write the words of the next block, with 0 for bits without an enabled microphone.
-
-        The bits follow finite signals (mic, sample) up to about 0.6 of full scale, 1; above, the loop overloads and
-        recovers.
-        """
+        """Write the words of the next block, with 0 for bits without an enabled microphone."""
+        # The bits follow signals (mic, sample) up to about 0.6 of full scale, 1; above, the loop overloads and
+        # recovers.
         octets = out.view(np.uint8)  # words are little-endian, like the processors that this package supports
         checks.shape("signals", (len(signals), min(signals.shape[1], len(out))), (len(self._states), len(out)))
         checks.shape("out, in bytes,", octets.shape, (len(out), len(self._mics)))

@@ -61,10 +61,7 @@ class Paths:
 def pairs(
     firsts: Seen[Transmitters], seconds: Seen[Receivers], largest: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the ways (path,) to and from each place that form a path of up to ``largest`` walls.
-
-    Paths are in the order of the emitter's images, then the microphones' images, then the places.
-    """
+    """Return the ways (path,) to and from each place that form a path of up to ``largest`` walls."""
     rank = seconds.place * (largest + 1) + seconds.n_mirrors
     sorted_ways = np.argsort(rank, kind="stable")
     rank = rank[sorted_ways]

@@ -17,12 +17,9 @@ _ROUNDED = 1 + 1e-9  # rounding of bounds
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """Highest amplitudes of an image over all directions, with side lobes of echoes inside and outside the window.
+    """Highest amplitudes of an image over all directions, with side lobes of echoes inside and outside the window."""
 
-    ``floor`` is the amplitude of the weakest reflector that the image shows; only louder echoes, ``level`` (path,), are
-    kept. Delays that differ by ``same_s`` count as one range. ``lobe`` returns the highest side lobe at a lag or
-    beyond.
-    """
+    # `floor` is that of the weakest reflector, `level` (path,) that of louder echoes; `lobe` is at a lag or beyond.
 
     floor: float
     level: Floats

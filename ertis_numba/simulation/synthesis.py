@@ -55,12 +55,9 @@ def _highest_hz(call: Call, rate_hz: float) -> float:
 def signals(
     arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, threads: int, clock: CostStopwatch
 ) -> Iterator[Floats]:
-    """Yield the signals of the record block by block: (mic, sample).
-
-    Each block synthesises the calls that begin in it as one spectrum, ``X(f) = S(f) Σ a(f) exp(-2πi f τ)``. Delays are
-    therefore exact, and filters are products. The remainder of a call that extends beyond its block is added to the
-    next blocks. Yielded arrays are reused, and they may extend beyond the `BLOCK` samples of the block.
-    """
+    """Yield the signals of the record block by block: (mic, sample)."""
+    # The calls that begin in a block are one spectrum, `S(f) Σ a(f) exp(-2πi f τ)`, and their remainders are added to
+    # the next ones. Yielded arrays are reused, and may exceed `BLOCK` samples.
     delay_samples = [entry.delay_s * rate_hz for entry in arrived]
     # Sound that begins before the record wraps to the end of the first transform, which is never read.
     before = _RING + max((math.ceil(max(0.0, -delay.min(initial=0.0))) for delay in delay_samples), default=0)
@@ -178,11 +175,8 @@ def _framed(frame: NoiseFrame, rate_hz: float, n_fft: int) -> NDArray[np.complex
 def _stretched(
     call: Call | NoiseFrame, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
 ) -> NDArray[np.complex128]:
-    """Return the spectra of a stretched call: (mic, bin).
-
-    The stretch is almost the same at all microphones. If the final phases of their calls lie within 1.2 rad, four
-    spectra suffice. Lagrange interpolation through Chebyshev nodes yields all others with an error of −100 dB.
-    """
+    """Return the spectra of a stretched call: (mic, bin)."""
+    # If their final phases lie within 1.2 rad, Lagrange interpolation of four spectra has an error of −100 dB.
     middle, half = (stretch.max() + stretch.min()) / 2, np.ptp(stretch) / 2
     apart_rad = 2 * math.pi * call.high_frequency_hz * call.end_s * half
     if len(stretch) <= _NODES or apart_rad > _FAR_APART_RAD:

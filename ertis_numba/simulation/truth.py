@@ -22,10 +22,7 @@ _LOWEST = 1e-30  # mean square of −300 dBFS
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
     """Return the echoes of a sensor's own call, then those of others if cross-emission is simulated, strongest first.
 
-    The range is half of the length of the sound path, and the direction that from which the sound arrives: over walls,
-    that of the mirror image. The level is that of the mean amplitude over the microphones and the call's band, relative
-    to the strongest own echo. The velocity is relative to the sensor, for echoes over walls only along the line of
-    sight.
+    Ranges are half of the sound path, directions those of arrival, and levels relative to the strongest own echo.
     """
     sight = Sight(shot, active)
     levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}

@@ -73,12 +73,8 @@ class SequenceNumbers:
         self._last = number
 
     def missing(self, noted: Iterable[ReasonedRange]) -> list[ReasonedRange]:
-        """Return the missing numbers in order: first, last and reason; neighbours with one reason are merged.
-
-        If the numbers rise, the missing part of a noted gap is outside of their interval or in a jump. Otherwise, as in
-        recordings without session identifiers, equal numbers cannot be distinguished, and all noted gaps are missing.
-        If two noted gaps overlap, the one that begins first has priority.
-        """
+        """Return the missing numbers in order: first, last and reason; neighbours with one reason are merged."""
+        # Without session identifiers, all noted gaps are missing. Of overlapping ones, the first has priority.
         known = list(_disjoint(noted))
         if self._first is not None and not self._late:
             absent = [(-_END, self._first - 1), *self.jumps, (self._last + 1, _END)]

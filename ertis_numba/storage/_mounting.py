@@ -27,11 +27,8 @@ def write_mounting(group: h5py.Group, place: Mapping[str, NDArray[np.float64]]) 
 
 
 def read_mounting(group: h5py.Group, path: Path) -> _Found:
-    """Return translation and rotation of a sensor, or None for both if its mounting is unknown.
-
-    Older files have no attribute ``mounting``, and store the origin if no mounting was given. In these files, the
-    origin therefore counts as unknown, unless the sensor was simulated.
-    """
+    """Return translation and rotation of a sensor, or None for both if its mounting is unknown."""
+    # Older files have no attribute `mounting`: their origin counts as unknown, unless the sensor was simulated.
     stated = group.attrs
     status = str(to_python(stated["mounting"])) if "mounting" in stated else ""
     if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & stated.keys()):

@@ -107,10 +107,7 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
 
 
 def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
-    """Return the poses at the measurements of a sensor, by increasing time; None if there are none.
-
-    Measurements without a pose are left out. The `max_gap_s` of the trajectory is then `MAX_GAP_S`.
-    """
+    """Return the poses at the measurements of a sensor, by increasing time; None if there are none."""
     found = [name for name in ("pose_position", "pose_rotation", "pose_source") if name in group]
     if not found:
         return None

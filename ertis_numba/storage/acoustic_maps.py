@@ -59,10 +59,7 @@ def write_bearings(group: h5py.Group, found: Sequence[tuple[Bearing, ...]]) -> N
 
 
 class BearingReader:
-    """Bearings of the maps of a sensor, by the number of a map.
-
-    ``group`` is that of the sensor, which has bearings.
-    """
+    """Bearings of the maps of a sensor, by the number of a map."""
 
     def __init__(self, group: h5py.Group, path: Path, settings: Settings) -> None:
         missing = [variable.name for variable in BEARINGS if variable.name not in group]

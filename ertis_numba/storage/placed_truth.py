@@ -41,14 +41,10 @@ def _scene_of(text: str) -> Scene:
 
 
 class PlacedTruth:
-    """Ground truth of the sensors of one platform, which grows with each pulse.
+    """Ground truth of the sensors of one platform, which grows with each pulse."""
 
-    Its reflectors are those that the image of a sensor can show at the place of the reflector: echoes of its own call
-    over a single surface. Those of several sensors are merged. ``trajectory`` has the poses of the platform in the
-    frame of a map; none for fused images. If they are not those of the scene, such as poses of an odometry that begins
-    at the origin, the scene is moved to fit them best. ``missing`` is the reason why there is no ground truth;
-    ``is_partial`` is then true if some recordings are simulated.
-    """
+    # Reflectors are echoes of own calls over a single surface. `trajectory` has the poses in the frame of a map, to
+    # which the scene is moved if they are not its own. `missing` is the reason why there is no ground truth.
 
     def __init__(
         self, readers: Sequence[Any], mountings: Mapping[str, Mounting], trajectory: Trajectory | None = None

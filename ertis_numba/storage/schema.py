@@ -54,11 +54,9 @@ _DIGEST_ITEMS: Final = 2**20
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """Array of a file, which is a coordinate if it has the name of its only axis.
+    """Array of a file, which is a coordinate if it has the name of its only axis."""
 
-    ``dtype`` is a NumPy type, ``str`` for text, or empty if the settings determine it. ``description`` is stored as the
-    attribute ``long_name``. ``units`` are in the notation of UDUNITS. ``optional`` is true if older files lack it.
-    """
+    # `dtype` is a NumPy type, `str` for text, or empty if the settings determine it. Older files lack `optional` ones.
 
     name: str
     dims: tuple[str, ...]
@@ -305,11 +303,8 @@ FORMER_NAMES: Final = {"amplitude": "energy", "session_id": "epoch", "gap_sessio
 
 
 def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
-    """Return the SHA-256 over the variables of a sensor, in hexadecimal.
-
-    For variables with one array per measurement, it covers only the CRC-32 of each row. A file can therefore be checked
-    in parts, without reading all of it first. The seed and the variables of the truth follow, if there is one.
-    """
+    """Return the SHA-256 over the variables of a sensor, in hexadecimal."""
+    # It covers only the CRC-32 of each row of measurements, so that a file can be checked in parts.
     digest = hashlib.sha256()
     _digest(digest, group, table)
     if "truth" in group:
@@ -332,10 +327,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
 
 
 def content_uuid(contents: Mapping[str, str]) -> str:
-    """Return the identity of a file, a UUID of version 8 that its content determines (RFC 9562, section 5.8).
-
-    Neither the name of a single sensor nor the order of several hashes in ``contents`` has an effect.
-    """
+    """Return the identity of a file, a UUID of version 8 that its content determines (RFC 9562, section 5.8)."""
     (content,) = contents.values() if len(contents) == 1 else (_joined(contents),)
     made = bytearray(bytes.fromhex(content)[:16])
     made[6] = made[6] & 0x0F | 0x80

@@ -49,13 +49,9 @@ Progress = Callable[[int, int], None]
 
 
 def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> SealingResult:
-    """Make the recording of a journal, verify and sync it, and then remove the journal.
-
-    Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name, also
-    if poses in it are damaged, or if a recording cannot contain one of its sensors; the others are sealed. Measurements
-    that were sealed before are not written again. Without ``overwrite``, an existing file with other content raises
-    DataError, and the journal stays.
-    """
+    """Make the recording of a journal, verify and sync it, and then remove the journal."""
+    # Damaged or refused measurements become gaps, and their journal is kept under another name. Without `overwrite`, an
+    # existing file with other content raises DataError.
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
     # An earlier process may have been killed just after it had removed the journal.

@@ -39,12 +39,8 @@ _MAX_PAUSE_S: Final = 0.5
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Seal a journal and return an exit code: 0 done, `FAILED`, `NO_MEASUREMENTS`, `IN_USE` or `INTERRUPTED`.
-
-    The path of the recording goes to stdout, and errors go to stderr in one line. With ``--json``, stdout has one
-    object per line: progress (``done``, ``of``), and at the end the fields of `SealingResult`, or ``error`` and
-    ``in_use``.
-    """
+    """Seal a journal and return an exit code: 0 done, `FAILED`, `NO_MEASUREMENTS`, `IN_USE` or `INTERRUPTED`."""
+    # The path goes to stdout. With `--json`, it has one object per line: progress, then `SealingResult` or `error`.
     parser = argparse.ArgumentParser(
         "python -m ertis_numba.storage.sealing_process", description=(__doc__ or "").partition("\n")[0]
     )
@@ -127,8 +123,7 @@ def _printable(text: str) -> str:
 class _GradualSync:
     """Gradual sync of a growing file, which need not exist yet, with a pause of ``rests`` times each step's duration.
 
-    A single sync would write all buffered data at once, and the sync of another small file would have to wait. A
-    journal's commit then took 370 ms instead of 47 ms.
+    A single sync would delay others: a journal's commit then took 370 ms instead of 47 ms.
     """
 
     def __init__(self, path: Path, rests: float) -> None:

@@ -96,10 +96,7 @@ class GroundTruth:
 
 
 class GroundTruthLog:
-    """Ground truth that grows with each measurement, in a nameless temporary file; use it in a ``with`` statement.
-
-    ``scene`` is TOML. ``left_out`` are effects that were not simulated although they change the image slightly.
-    """
+    """Ground truth that grows with each measurement, in a nameless temporary file; use it in a ``with`` statement."""
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
         self.scene = scene

@@ -59,11 +59,8 @@ def create_variables(
     dtypes: Mapping[str, str | np.dtype[Any]] | None = None,
     texts: Mapping[str, str] | None = None,
 ) -> None:
-    """Create the variables of ``table`` in ``group``, with a named scale for each axis that does not exist yet.
-
-    An axis without a length in ``sizes`` is omitted, unless it grows with the file. If the rows along time are samples
-    or images, each row is a chunk. ``dtypes`` replace types of the table, and ``texts`` fill text variables.
-    """
+    """Create the variables of ``table`` in ``group``, with a named scale for each axis that does not exist yet."""
+    # An axis without a length in `sizes` is omitted, unless it grows with the file. Samples or images are chunks.
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]
     # Coordinates come first, so that the others find the scale of each axis.

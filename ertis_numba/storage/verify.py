@@ -27,11 +27,8 @@ _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeEr
 
 
 def find_damage(path: Path) -> str:
-    """Return the first damaged object of a file and its damage, as one line; empty if there is none.
-
-    HDF5 stores checksums of everything except the references from variables to their axes. The check therefore compares
-    them with the expected names of the axes.
-    """
+    """Return the first damaged object of a file and its damage, as one line; empty if there is none."""
+    # HDF5 has no checksums of references from variables to their axes, which are compared with the expected names.
     place = "/"
     try:
         with h5py.File(path, "r") as file:
@@ -87,12 +84,10 @@ _SQLITE = b"SQLite format 3\0"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorReport:
-    """Result for one sensor; ``fault`` is the reason why nothing of it can be read.
+    """Result for one sensor; ``fault`` is the reason why nothing of it can be read."""
 
-    ``measurements`` counts damaged ones too; ``out_of_order`` are indices with a number not above the previous one of
-    the session. ``remark`` describes damage to the file or to poses, and losses from its journal that no gap covers.
-    ``copies`` are indices of recorded measurements that equal the one before in every sample, as sound never does.
-    """
+    # `out_of_order` numbers are not above the previous one, and `copies` equal the measurement before. `remark`
+    # describes damage to the file or to poses, and losses from its journal that no gap covers.
 
     sensor: str
     measurements: int = 0
@@ -115,11 +110,8 @@ class SensorReport:
 
 
 def verify(path: str | Path) -> list[SensorReport]:
-    """Read a whole recording or journal, and return missing and damaged measurements for each sensor.
-
-    For a recording, this checks the hash over the content of each sensor, the CRC-32 of each measurement, and the order
-    of the sequence numbers. For a journal, it checks the CRC-32 of each record, each measurement and each pose.
-    """
+    """Read a whole recording or journal, and return missing and damaged measurements for each sensor."""
+    # This checks the hash of each sensor, the CRC-32 of each measurement, and the order of the sequence numbers.
     path = Path(path)
     if _is_journal(path):
         with Journal.open(path) as journal:

@@ -220,10 +220,7 @@ def _prepare(kept: _SensorMaps, choices: Choices, scale: LevelScale, radius_m: f
 def _marks(
     found: AcousticMap, band: Edges | None, shades: NDArray[np.uint8], *, is_planar: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return unit vectors of the sources, (source, axis), or of the loudest direction if none were searched.
-
-    Their distances are (1, source) for directions in one plane, else (2, source).
-    """
+    """Return unit vectors of the sources, (source, axis), or of the loudest direction if none were searched."""
     grid = unit_vectors(found.azimuth_rad, found.elevation_rad)
     if found.has_bearings:
         heard = [each for each in found.bearings if band is None or each.band_hz == band]

@@ -31,12 +31,9 @@ _GRID: Final[dict[str, Any]] = {
 
 
 class LevelPlane:
-    """Renderer of the levels of the same directions (direction,), in pictures of a width in pixels.
+    """Renderer of the levels of the same directions (direction,), in pictures of a width in pixels."""
 
-    Directions at several elevations have a plane of azimuth (positive to the left) and elevation, in which each point
-    has the colour of the nearest direction. Directions in a horizontal plane have a polar plot, whose radius and colour
-    are the level.
-    """
+    # Several elevations have a plane of azimuth and elevation; directions in a horizontal plane a polar plot.
 
     def __init__(
         self, azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64], *, width_px: int = 520
@@ -92,10 +89,8 @@ class LevelPlane:
         return x + float(right) * scale, y - float(ahead) * scale
 
     def picture(self, shades: NDArray[np.uint8], table: NDArray[np.uint8], scale: LevelScale) -> NDArray[np.uint8]:
-        """Return the picture with axes and a ring around the loudest direction: (row, column, 3).
-
-        ``shades`` (direction,) come from `LevelScale.shade`, and ``table`` (256, 3) has the colours of levels.
-        """
+        """Return the picture with axes and a ring around the loudest direction: (row, column, 3)."""
+        # `shades` (direction,) come from `LevelScale.shade`, and `table` (256, 3) has the colours of levels.
         made = self._page.copy()
         flat = made.reshape(-1, 3)
         flat[self._sampling.places] = table[self._shown(shades)]

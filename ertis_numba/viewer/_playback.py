@@ -45,11 +45,9 @@ _CONTENTS: Final = {"energyscape": "images", "acoustic_map": "acoustic maps"}
 
 
 class MapSequence:
-    """Acoustic maps of one sensor; call it with the number of a measurement.
+    """Acoustic maps of one sensor; call it with the number of a measurement."""
 
-    Every ``passive.averages`` measurements form a group, as in `AcousticCamera.process_many`. The map of a measurement
-    is the mean of its group up to this measurement. Measurements in order are therefore processed once.
-    """
+    # Every `passive.averages` measurements form a group, and a map is the mean of its group so far.
 
     def __init__(self, reader: RecordingReader, *, device: Literal["auto", "cpu", "cuda", "numpy"]) -> None:
         self._reader = reader
@@ -195,10 +193,8 @@ class Playback:
         self._stack.close()
 
     def _end(self) -> None:
-        """End the thread; this takes some seconds during a compilation.
-
-        An interpreter that ends while a thread is in the compiler crashes, because LLVM is destroyed under it.
-        """
+        """End the thread; this takes some seconds during a compilation."""
+        # An interpreter that ends while a thread is in the compiler crashes, because LLVM is destroyed under it.
         self._closed.set()
         if self._thread is not None:
             self._thread.join()

@@ -120,11 +120,9 @@ class _PageRecording:
 
 
 class Recordings:
-    """Recordings in progress, by one clock; time starts when the first frame is drawn.
+    """Recordings in progress, by one clock; time starts when the first frame is drawn."""
 
-    A separate thread builds and delivers a page, because this takes seconds for a long recording and would stop a live
-    view. ``serializer`` returns what viser keeps from now on, and ``finished`` the function that completes a page.
-    """
+    # A thread delivers pages, which takes seconds. `serializer` returns what viser keeps, and `finished` a page.
 
     def __init__(
         self, serializer: Callable[[], Any], finished: Callable[[], Callable[[str], str]] = lambda: str

@@ -177,10 +177,7 @@ class ViewedScene:
         )
 
     def _with_fused_points(self, joined: dict[str, Drawn], choices: Choices, now_s: float) -> dict[str, Drawn]:
-        """Return objects of fused sensors with the points of the fusion, all at the first sensor.
-
-        The points of a single sensor contain foreign echoes, where there is no reflector.
-        """
+        """Return objects of fused sensors with the points of the fusion, all at the first sensor."""
         cloud, time_s = self._plan.points, max(drawn.time_s for drawn in joined.values())
         clouds = self._fused_clouds
         if cloud is not None and not (clouds and clouds[-1].points is cloud):

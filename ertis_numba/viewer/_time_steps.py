@@ -59,11 +59,8 @@ def usual_s(times_s: Iterable[float]) -> float | None:
 
 
 def time_steps_of(stamps: dict[str, list[Stamp]]) -> tuple[tuple[TimeStep, ...], list[str]]:
-    """Return the time steps of measurements in the order of their times, and notes on replaced times.
-
-    If no clock was set, as in a simulation, times count from an arbitrary start. If some were set, the other
-    measurements have no time: they get the typical distance to their neighbours. Without any times, the numbers count.
-    """
+    """Return the time steps of measurements in the order of their times, and notes on replaced times."""
+    # Without clocks, times count from an arbitrary start; single measurements get the typical distance to neighbours.
     given = {name: [stamp.timestamp_ns for stamp in each] for name, each in stamps.items()}
     known = _known(stamps)
     begin_ns = min(

@@ -1,8 +1,6 @@
 """Comparison of the strongest arrival with other arrays: other layouts, orders, sizes, and converters out of step.
 
-A fault of the array as a whole is certain only relative to an alternative. Tolerances of microphones spread the
-arrival over all candidates alike, so that the ratio of their residuals decides, which needs no limit in seconds and
-holds for arrays of any size.
+Tolerances of microphones spread the arrival over all candidates alike, so that the ratio of their residuals decides.
 """
 
 import math
@@ -52,11 +50,7 @@ _LEAST_CURVATURE: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class _Match:
-    """Fit of a wavefront to times of arrival, with the RMS of the residuals without the largest ones.
-
-    ``slowness`` is relative to that of sound, ``delay_s`` that of some channels relative to the others, and ``n_spare``
-    the number of microphones beyond the unknowns.
-    """
+    """Fit of a wavefront to times of arrival, with the RMS of the residuals without the largest ones."""
 
     spread_s: float
     slowness: float
@@ -72,10 +66,7 @@ def unobservable(
     *,
     is_direct: bool = False,
 ) -> tuple[NotObservable, ...]:
-    """Return the faults of an array that an arrival cannot reveal, with the reasons.
-
-    ``path_m`` is the way of the sound since the emission; the curvature of direct sound shows the size of the array.
-    """
+    """Return the faults of an array that an arrival cannot reveal, with the reasons."""
     n_mics, n_unknowns = len(positions_m), 1 + places_of(positions_m).shape[1]
     n_spare = _kept(n_mics, n_unknowns) - n_unknowns
     if n_mics < 2:
@@ -125,11 +116,7 @@ def find_other_array(
     *,
     is_near: bool = False,
 ) -> Finding | None:
-    """Return the finding of an array that fits the strongest arrival much better than the layout; None without one.
-
-    ``times_s`` (mic,) are those that the layout expects; ``is_near`` marks sound too early for its curvature to be
-    known.
-    """
+    """Return the finding of an array that fits the strongest arrival much better than the layout; None without one."""
     picked = list(channels)
     own = _best(times_s, layout.positions_m[picked], path_m, speed_m_s)
     every = [times_s]

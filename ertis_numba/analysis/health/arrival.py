@@ -40,10 +40,7 @@ class Compressed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Wavefront fitted to times of arrival, with its time (mic,) at each microphone, and the median absolute residual.
-
-    ``inliers`` agree with it. At ``emission_s``, it passes the array's centre or leaves the emitter.
-    """
+    """Wavefront fitted to times of arrival, its time (mic,) at each microphone, and the median absolute residual."""
 
     delay_s: NDArray[np.float64]
     inliers: NDArray[np.bool_]

@@ -20,12 +20,8 @@ _DRIFT_S: Final = 50e-6  # Difference of emission times that a clock or a trigge
 
 
 def fit_emission(times_s: NDArray[np.float64], positions_m: NDArray[np.float64], speed_m_s: float) -> float | None:
-    """Return the time at which the emitter at the array's centre emitted an arrival; None if it may be an echo.
-
-    The times are fitted by a plane wave and a multiple of the distances from the centre. The multiple is 1 for direct
-    sound, and near 0 for echoes. Arrays without distances that a plane wave cannot imitate, such as rings, have no
-    result.
-    """
+    """Return the time at which the emitter at the array's centre emitted an arrival; None if it may be an echo."""
+    # The times are a plane wave and a multiple of the distances from the centre: 1 for direct sound, near 0 for echoes.
     _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
     plane_s = positions_m @ axes[extent > 1e-3 * max(float(extent[0]), 1e-9)].T / speed_m_s
     sphere_s = np.linalg.norm(positions_m, axis=1) / speed_m_s

@@ -241,11 +241,7 @@ def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
 
 
 def _have_noise(channels: Iterable[ChannelHealth]) -> bool:
-    """Return True if PCM samples contain noise; without noise, a symmetrical array may receive identical echoes.
-
-    Up to three quarters of the channels may be stuck where the record is quietest. Channels with other faults, such as
-    a tone, do not count.
-    """
+    """Return True if PCM samples contain noise; without noise, a symmetrical array may receive identical echoes."""
     levels = sorted(item.noise_dbfs for item in channels if item.noise_dbfs is not None and not item.faults)
     return bool(levels) and levels[3 * len(levels) // 4] > _LOWEST_NOISE_DBFS
 

@@ -12,10 +12,7 @@ _LAYOUT = "set array.layout to the layout of this array, with its channels in th
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """Description of a fault; ``unit`` is empty for a share or a count, ``of_record`` marks faults of all channels.
-
-    ``remedy`` is an imperative sentence without a full stop; `DISABLE` by default.
-    """
+    """Description of a fault; ``unit`` is empty for a share or a count, ``of_record`` marks faults of all channels."""
 
     unit: str = ""
     remedy: str = DISABLE

@@ -52,11 +52,7 @@ def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> lis
 def noise_findings(
     channels: Sequence[ChannelHealth], quiet_db: NDArray[np.float64], *, white_db: float | None
 ) -> list[Finding]:
-    """Return the channels with more noise than the others, each in its own quietest eighth of the record.
-
-    ``quiet_db`` is in the call's band, relative to a full scale of 1, and ``white_db`` that of white bits; None for
-    PCM.
-    """
+    """Return the channels with more noise than the others, each in its own quietest eighth of the record."""
     if len(channels) < 2 or (white_db is not None and in_limit_cycles(quiet_db)):
         return []
     usual_db = np.maximum(quiet_db, _LOWEST_NOISE_DB)

@@ -32,10 +32,7 @@ KNOWN_PLACE: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NotObservable:
-    """Names of faults, such as ``order of channels``, that a recording cannot show, a reason, and a remedy as clauses.
-
-    ``cases`` are the alternatives that are possible; empty if they are not counted.
-    """
+    """Names of faults, such as ``order of channels``, that a recording cannot show, a reason, and a remedy."""
 
     faults: tuple[str, ...]
     reason: str
@@ -48,10 +45,7 @@ class NotObservable:
 
 
 def in_all(reports: Sequence[Sequence[NotObservable]]) -> tuple[NotObservable, ...]:
-    """Return the faults that several recordings together cannot show, with the first reason for each.
-
-    Recordings of different echoes exclude different alternatives.
-    """
+    """Return the faults that several recordings together cannot show, with the first reason for each."""
     if not reports:
         return ()
     left: dict[str, tuple[str, ...] | None] = {}

@@ -51,11 +51,8 @@ def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> 
 
 
 def _clipped(signal: NDArray[np.float32], peak: float, step: float) -> tuple[float, float]:
-    """Return the share of samples at the limits of a converter or of an amplifier before it, and the level of these.
-
-    Samples within ``step`` of the largest or least value are clipped if far more than just below: a sine has 1.4 times
-    as many, noise fewer. A preamplifier may clip at any level, on both sides differently.
-    """
+    """Return the share of samples at the limits of a converter or of an amplifier before it, and the level of these."""
+    # A sine has 1.4 times as many samples within `step` of its extremes as just below, and noise fewer.
     width = step or peak * _FLOAT_WIDTH
     overload = float(np.mean(np.abs(signal) >= (_FULL if step else peak)))
     if overload > MAX_SATURATED or peak < _MIN_STEPS * width:

@@ -56,11 +56,8 @@ def stuck_at_times(columns: Sequence[tuple[int, NDArray[Any]]], *, largest: int)
 
 
 def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Finding]:
-    """Return a finding for the longest block of samples that occurs twice.
-
-    Anchors are samples whose hash, together with the samples after them, ends in six zeros. A block that is repeated at
-    any distance therefore has the same anchors. The most frequent distances between equal anchors are compared in full.
-    """
+    """Return a finding for the longest block of samples that occurs twice."""
+    # Samples whose hash ends in six zeros are anchors; frequent distances between equal anchors are compared in full.
     n_samples = len(words)
     # With few microphones, modulators repeat their bits occasionally by chance.
     if n_samples < 2 * MIN_REPEATED_SAMPLES or len(channels) < _MIN_CHANNELS:
@@ -111,10 +108,7 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
 
 
 def _is_cycle(block: NDArray[Any]) -> bool:
-    """Return True if a block is periodic, with a period shorter than the blocks that are reported.
-
-    Modulators without noise alternate for thousands of samples. All such sections are equal.
-    """
+    """Return True if a block is periodic, with a period shorter than the blocks that are reported."""
     start = block[: 4 * MIN_REPEATED_SAMPLES]
     lags = range(1, min(MIN_REPEATED_SAMPLES, len(start)))
     return any(np.mean(start[lag:] != start[:-lag]) <= _MIN_CHANGING for lag in lags)

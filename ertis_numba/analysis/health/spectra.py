@@ -36,10 +36,7 @@ def by_spectra(
     band_hz: tuple[float, float],
     missing: Sequence[tuple[int, int]] = (),
 ) -> tuple[list[ChannelHealth], tuple[float, ...], tuple[str, ...], list[Finding]]:
-    """Return channels with spectral statistics, common tones, impossible checks, and findings of level and noise.
-
-    The statistics are those of the segments without ``missing`` parts (first, stop).
-    """
+    """Return channels with spectral statistics, common tones, impossible checks, and findings of level and noise."""
     size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(n_samples / _SEGMENTS)))
     line_hz = settings.recording.sample_rate_hz / size
     low = round(band_hz[0] / line_hz)
@@ -112,11 +109,7 @@ def _intact(n_samples: int, size: int, missing: Sequence[tuple[int, int]]) -> ND
 def _deaf(
     power: NDArray[np.float64], noise: NDArray[np.float64], sensitivity_db: NDArray[np.float64], few: int
 ) -> NDArray[np.bool_]:
-    """Return True for each channel without sound in every eighth nearly as loud as the loudest: (mic,).
-
-    A single eighth is not sufficient, because two echoes can cancel at one microphone. ``power`` (mic, segment) is in
-    the call's band, with segments in ascending order of loudness.
-    """
+    """Return True for each channel without sound in every eighth nearly as loud as the loudest: (mic,)."""
     is_deaf, loudest_db = np.ones(len(power), bool), math.inf
     for last in range(power.shape[1], few, -few):
         loud = power[:, max(few, last - few) : last].mean(axis=1)

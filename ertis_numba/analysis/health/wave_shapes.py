@@ -37,10 +37,7 @@ def fit_curved(
     speed_m_s: float,
     slopes_of: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return times of arrival (..., mic) without the delays by the curvature of the wave, in 1/m.
-
-    ``slopes_of`` fits a plane wave to times, and returns its delay per metre along each axis of `places_of`.
-    """
+    """Return times of arrival (..., mic) without the delays by the curvature of the wave, in 1/m."""
     places_m, flat_s = places_of(positions_m), times_s
     for _ in range(_ITERATIONS):
         slope_m = slopes_of(flat_s) @ places_m.T * speed_m_s

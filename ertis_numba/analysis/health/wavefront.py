@@ -55,11 +55,7 @@ _GATE_PERIODS = 2.0  # Length of the gate on either side, in units of 1 / bandwi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StrongestSound:
-    """Strongest arrival of a record: times (mic,) without calibrated delays, and the way since the emission.
-
-    ``is_near`` if the way is too short for an echo; ``shifts`` if the record does not begin with the emission;
-    ``other`` is an array that fits far better.
-    """
+    """Strongest arrival of a record: times (mic,) without calibrated delays, and the way since the emission."""
 
     found: Compressed
     times_s: NDArray[np.float64]
@@ -282,11 +278,10 @@ def _moved(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coherence:
-    """Correlation of real signals (mic,) with a reference: its highest value and lag, and the same by their powers.
+    """Correlation of real signals (mic,) with a reference: its highest value and lag, and the same by their powers."""
 
-    ``at_zero``, ``negative`` and ``opposite`` are the highest, the magnitude of the lowest, and the latter normalised
-    by the powers, at lags within 10 µs.
-    """
+    # `at_zero`, `negative` and `opposite`: the highest, the magnitude of the lowest, and the latter by the powers, at
+    # lags within 10 µs.
 
     lag_s: NDArray[np.float64]
     peak: NDArray[np.float64]

@@ -24,12 +24,9 @@ _ORDERS: Final = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">"}
 
 @dataclass(frozen=True, slots=True)
 class WavFile:
-    """Content of a WAV file: samples (sample, channel), mapped into memory, at the full scale of their integer type.
+    """Content of a WAV file: samples (sample, channel), mapped into memory, at the full scale of their integer type."""
 
-    Bytes are unsigned. ``valid_bits``: used bits that the header states; samples may have more. ``notes``:
-    contradictions in the file, and their resolution. ``chunks``: contents of other chunks up to 1 MiB by name, such as
-    ``bext``; of a ``LIST``, by the name of the list, such as ``INFO``. The first of several with one name counts.
-    """
+    # Bytes are unsigned. `notes` are contradictions in the file and their resolution; `chunks` has others up to 1 MiB.
 
     rate_hz: float
     samples: Samples

@@ -16,11 +16,7 @@ _MIN_BUSY_S = 0.05
 
 
 def gap_reason(event: BlockArrived) -> str:
-    """Return the reason of the gap before a measurement.
-
-    A sensor counts each measurement that it makes, including those that it drops because its buffer is full. If other
-    sensors answered a pulse that a sensor did not count, the sensor made no measurement.
-    """
+    """Return the reason of the gap before a measurement."""
     if event.damaged:
         return DAMAGED
     if not event.skipped:

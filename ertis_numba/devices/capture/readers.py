@@ -95,11 +95,7 @@ class TriggerClock:
 
 
 class SensorReader(threading.Thread):
-    """Thread that receives the blocks of one sensor, and reconnects after it was unplugged.
-
-    The driver is configured, and armed with SYNC pulses, which need no ``pace``. Nothing else may use the sensor. While
-    ``events`` is full, the sensor waits.
-    """
+    """Thread that receives the blocks of one sensor, and reconnects after it was unplugged."""
 
     def __init__(
         self,

@@ -47,13 +47,9 @@ class SettingsChange:
 
 
 class CaptureSession:
-    """Capture session: receives measurements from sensors, stores them durably, and reports them.
+    """Capture session: receives measurements from sensors, stores them durably, and reports them."""
 
-    Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
-    and a missing number is a missing measurement. ``sonars`` are configured, and active ones are armed in this order.
-    ``on_stored`` gets entries once they are durable; ``on_tick`` is called about ten times a second. ``complete`` and
-    ``incomplete`` count the pulses with measurements of all sensors, and of some sensors only.
-    """
+    # Sequence numbers start at 0; a missing number is a missing measurement. `on_stored` gets durable entries.
 
     def __init__(  # noqa: PLR0913  trigger, limits and callbacks
         self,

@@ -51,11 +51,7 @@ class _PendingRecording:
 
 
 class Mainboard:
-    """Device that obeys commands and records, from power-up until it is unplugged.
-
-    If ``accepts`` returns False for a configuration, the device reports a wrong hash of the call and does not measure.
-    ``outputs`` wait to be sent, in order. ``refused`` counts invalid commands and unusable numbers.
-    """
+    """Device that obeys commands and records, from power-up until it is unplugged."""
 
     def __init__(self, measurements: Measurements, accepts: Accepts | None = None) -> None:
         self.registers = Registers()

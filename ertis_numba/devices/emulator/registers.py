@@ -59,13 +59,10 @@ class DeviceConfig:
 
 
 class Registers:
-    """State of a device, initially as after power-up.
+    """State of a device, initially as after power-up."""
 
-    The initial state of a real device is known for the amplifier (on) and the external trigger (off); the rest is
-    assumed, and so are the answers to settings, here 1 if they have an effect, otherwise 0. ``clock`` is 0 for 4.5 MHz
-    and 1 for 1.125 MHz. ``armed`` is 1 if SYNC pulses at input ``pin`` trigger. ``counter`` is that of the next
-    measurement, with ``n_bytes`` of words. The first ``n_codes`` of ``codes``, (65535,), are the call.
-    """
+    # `clock` is 0 for 4.5 MHz and 1 for 1.125 MHz. Real devices are known to begin with amplifier on and trigger off;
+    # the rest is assumed.
 
     def __init__(self) -> None:
         self.n_bytes = 655_360

@@ -16,13 +16,10 @@ _SECOND_NS = 1_000_000_000
 
 
 class SyncChain:
-    """Trigger of emulated devices at a steady rate; use it in a ``with`` statement, or `start` it.
+    """Trigger of emulated devices at a steady rate; use it in a ``with`` statement, or `start` it."""
 
-    Deadlines are absolute, so the rate does not drift; a pulse that would be too late for the next is skipped. Each
-    device has its pulse `SYNC_STEP_S` after the previous one in the chain, but only in its timestamps: samples from a
-    scene contain that step already. Pulses are numbered from the first that a device accepted. ``before`` is called
-    with the number before each pulse, and pulses meanwhile are left out.
-    """
+    # Deadlines are absolute, and late pulses are skipped. The `SYNC_STEP_S` between devices is in timestamps only,
+    # because samples from a scene contain it.
 
     def __init__(
         self, devices: Sequence[Emulator], rate_hz: float, *, before: Callable[[int], None] = lambda _: None

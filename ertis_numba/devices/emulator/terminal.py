@@ -17,11 +17,9 @@ _LINE = re.compile(rb"[^!\n]+(?=!)|!?[^!\n]*\n|![^!\n]*(?=!)")
 
 
 class Terminal:
-    """Raw pseudo terminal: ``master`` is a descriptor that never waits, ``port`` the path for a host.
+    """Raw pseudo terminal: ``master`` is a descriptor that never waits, ``port`` the path for a host."""
 
-    The host's side stays open here, so that a host may open and close it for every command. Unread bytes then wait in
-    the system's buffer of about 12 kB; a real port would discard them.
-    """
+    # The host's side stays open here, so that a host may open and close it for every command.
 
     def __init__(self) -> None:
         self.master, self._slave = os.openpty()
@@ -57,11 +55,9 @@ class Terminal:
 
 
 class CommandReader:
-    """Splitter of input into command lines.
+    """Splitter of input into command lines."""
 
-    The authors' code for Windows sends a measurement command without a line end: it is complete once the next one
-    begins, or after a while.
-    """
+    # The authors' code for Windows sends a measurement command without a line end.
 
     def __init__(self) -> None:
         self._rest = b""

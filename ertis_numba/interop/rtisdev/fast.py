@@ -1,8 +1,6 @@
 """Fast chain for the images of RTIS Dev, if it supports the arguments.
 
-The fast chain computes the exact envelope of band-pass signals. RTIS Dev's low pass for rectified beams then smooths
-this envelope, at the rate of the image. The result differs a little from that of `Processor`. Simulated measurements of
-loud and of weak echoes show this difference.
+RTIS Dev's low pass for rectified beams smooths the exact envelope, so that results differ a little.
 """
 
 import tempfile

@@ -103,10 +103,7 @@ class Configuration:
 
 
 class Processor:
-    """Thread-safe processing of measurements with one configuration.
-
-    Fourier transforms and filters other than that of PDM use the CPU on any device.
-    """
+    """Thread-safe processing of measurements with one configuration."""
 
     def __init__(self, configuration: Configuration, *, device: str = "auto") -> None:
         self._given = configuration
@@ -277,11 +274,8 @@ def rounded(taps: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int16], float]:
 
 
 def _sixteen_bits(signals: Real, n_tiles: int) -> tuple[NDArray[np.int16], Real]:
-    """Return tiles of signals as 16-bit numbers whose sum over microphones fits 16 bits, and their units.
-
-    With 32 microphones, a sample has 11 bits of the largest one in its tile. The error of a beam is then about 85 dB
-    below a beam in which all microphones have such a sample.
-    """
+    """Return tiles of signals as 16-bit numbers whose sum over microphones fits 16 bits, and their units."""
+    # With 32 microphones, a sample has 11 bits of the largest one in its tile, and a beam an error of about -85 dB.
     windows = np.lib.stride_tricks.sliding_window_view(signals, signals.shape[1] - (n_tiles - 1) * _TILE, axis=1)
     tiles = windows[:, ::_TILE].swapaxes(0, 1)
     units = np.maximum(np.abs(tiles).max(axis=(1, 2)) / np.float32(32_767 // len(signals)), np.float32(1e-30))

@@ -94,11 +94,8 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
 
 
 def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) -> NDArray[np.float32]:
-    """Process a measurement with a preloaded configuration; return (dim1, dim2).
-
-    With a ``pdm`` other than 0, ``data`` are PDM words (sample,) uint32. Otherwise they are the finite result of an
-    earlier stage: signals (mic, sample), or, without beamforming, beams (direction, sample).
-    """
+    """Process a measurement with a preloaded configuration; return (dim1, dim2)."""
+    # With `pdm`, `data` are words (sample,) uint32, otherwise signals (mic, sample) or beams (direction, sample).
     with _errors_logged():
         name = arguments.text("name", name)
         with _turn:

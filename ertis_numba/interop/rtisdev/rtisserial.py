@@ -1,7 +1,4 @@
-"""Serial port of an eRTIS, with the functions of the closed module ``rtisserial``.
-
-There is one connection per process, as in the original.
-"""
+"""Serial port of an eRTIS, with the functions of the closed module ``rtisserial``."""
 
 import errno
 import logging
@@ -34,11 +31,8 @@ _awaits_triggers = False  # after the command that switches external triggers on
 
 
 def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
-    """Open a serial port, or that of ERTIS_RTISDEV_PORT, and close the former; drop bytes for a former program.
-
-    Raises ConnectionRefusedError if another program uses the port, and ConnectionError if it does not exist or may not
-    be used. USB has no ``baud``.
-    """
+    """Open a serial port, or that of ERTIS_RTISDEV_PORT, and close the former; drop bytes for a former program."""
+    # Raises ConnectionRefusedError if another program uses it, otherwise ConnectionError. USB has no `baud`.
     global _line  # noqa: PLW0603  one connection per process
     with _errors_translated():
         arguments.text("port", port)

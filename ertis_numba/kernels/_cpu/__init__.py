@@ -72,11 +72,8 @@ def _layer_is_reentrant() -> bool:
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Run the enclosed kernels of this Python thread on ``count`` threads.
-
-    Without OpenMP and TBB, Numba falls back to its workqueue layer. That layer aborts the process if two threads use it
-    concurrently. With it, and until the layer is known, one thread runs at a time.
-    """
+    """Run the enclosed kernels of this Python thread on ``count`` threads."""
+    # Numba's workqueue layer aborts the process if two threads use it, so that one runs at a time with it.
     checks.integer("threads", count, 1, _MAX_THREADS)
     before = numba.get_num_threads()
     with contextlib.nullcontext() if _layer_is_reentrant() else _ONE_AT_A_TIME:

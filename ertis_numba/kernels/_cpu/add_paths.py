@@ -1,7 +1,6 @@
 """Add delayed and filtered copies of a call's spectrum.
 
-The phase rotation of a delay from bin to bin is one complex multiplication. Eight bins are computed in parallel, and
-each advances by eight bins. The chain of multiplications is thus an eighth as long, and fills a vector.
+Eight bins are computed in parallel, and each advances by eight, which shortens the chain of multiplications.
 """
 
 import math

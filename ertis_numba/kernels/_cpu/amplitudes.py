@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Amplitudes from the sums of streams: Newton's identities and the coherence factor.
 
-The code uses LLVM's vector types. LLVM vectorises the plain loops as well, but checks each of them for overlapping
-arrays, which takes four times as long.
+LLVM would check each plain loop for overlapping arrays, which takes four times as long as its vector types.
 """
 
 from llvmlite import ir

@@ -1,7 +1,4 @@
-"""Performance ceilings of this machine: kernels that measure only memory bandwidth or arithmetic throughput.
-
-They are for benchmarks, not part of the signal chain.
-"""
+"""Performance ceilings of this machine: kernels that measure only memory bandwidth or arithmetic throughput."""
 
 import numpy as np
 from llvmlite import ir

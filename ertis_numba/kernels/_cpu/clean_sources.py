@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Find the sources of each bin, by subtracting all sound that is coherent with the loudest direction.
 
-A bin is computed by one thread, which keeps the phases of all directions in the second cache: those of 3000 directions
-and 32 microphones are 770 kB. Each round reads them once, for the map of one component.
+One thread computes a bin, and keeps all phases in the second cache: 770 kB for 3000 directions.
 """
 
 import math

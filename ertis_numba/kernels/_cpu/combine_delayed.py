@@ -1,8 +1,5 @@
 # mypy: ignore-errors
-"""Combine the delayed real signals of all microphones: sums, or sums of products, with or without coherence factor.
-
-Sums stay in registers during the loop over the microphones, so that each sample is read once per direction.
-"""
+"""Combine the delayed real signals of all microphones: sums, or sums of products, with or without coherence factor."""
 
 import numpy as np
 from numba import njit, prange

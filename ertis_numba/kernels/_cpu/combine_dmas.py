@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Multiply the roots of the microphones' signals with one another, and sum the products.
 
-The root of a product is the product of the roots. Roots are therefore computed once per sample and once per weight, not
-once per direction.
+Roots are computed once per sample and once per weight, because the root of a product is the product of roots.
 """
 
 import math

@@ -1,9 +1,5 @@
 # mypy: ignore-errors
-"""Amplitudes from delay-and-sums of streams on 16-bit samples, without writing the sums to memory.
-
-The streams of a direction are summed one after the other, directly or from beams of a beam grid. Their sums stay in the
-L1 cache until the amplitude is computed.
-"""
+"""Amplitudes from delay-and-sums of streams on 16-bit samples, without writing the sums to memory."""
 
 import numpy as np
 from numba import njit, prange, types

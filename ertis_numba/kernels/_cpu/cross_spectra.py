@@ -1,9 +1,5 @@
 # mypy: ignore-errors
-"""Sum the products of the spectra of each two microphones over blocks of samples.
-
-A chunk of successive bins is separated into real and imaginary parts once. Its sums then remain in registers while all
-blocks are read.
-"""
+"""Sum the products of the spectra of each two microphones over blocks of samples."""
 
 import numpy as np
 from numba import njit, prange

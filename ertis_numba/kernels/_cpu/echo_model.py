@@ -14,11 +14,8 @@ __all__ = ["predict", "steer"]
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def steer(pulse, beams, row, offset_m, is_focused, given, work):
-    """Compute the beams of samples and the correlations of their noise.
-
-    ``beam`` (sample, 5, mic) contains the assumed path relative to that to the maximum, its carrier with the gain, and
-    the ratio of slope and gain.
-    """
+    """Compute the beams of samples and the correlations of their noise."""
+    # `beam` (sample, 5, mic): path relative to that to the maximum, carrier with the gain, and slope / gain.
     tables, positions_m, _, _, range_m, _, _, _, scale = given
     _, noises, beam, _, _, _ = work
     for sample in range(len(row)):

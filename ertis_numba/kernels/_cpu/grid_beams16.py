@@ -83,10 +83,7 @@ def new_pairs(count):
 
 @njit(nogil=True, cache=True)
 def fill_pairs(tiles, tile, offsets, weights, first, last, n_used, pairs):
-    """Fill ``pairs``, (point, part, range), with beams of points ``first … last``, the next ones in the high 16 bits.
-
-    Ranges from ``n_used`` on are arbitrary.
-    """
+    """Fill ``pairs``, (point, part, range), with beams of points ``first … last``, the next ones in the high bits."""
     both = np.empty((2, 2 * RANGES), np.int16)
     for node in range(first, last + 1):
         _node_tile(tiles, tile, offsets, weights, node, n_used, both, node % 2)

@@ -1,7 +1,4 @@
-"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, in single precision.
-
-The grid beams of a tile stay in the L2 cache between the two steps.
-"""
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, in single precision."""
 
 import numpy as np
 from llvmlite import ir

@@ -1,8 +1,6 @@
 """Beams on a coarse grid by delay-and-sum, interpolated to all directions, on 16-bit samples.
 
-Both steps multiply pairs of 16-bit numbers. In the second step, a pair consists of two neighbouring grid points at one
-range. An instruction therefore adds two grid points at once, and loads never cross a cache line. The grid beams of a
-tile stay in the L2 cache between the steps.
+An instruction adds two neighbouring grid points at one range, and loads never cross a cache line.
 """
 
 import numpy as np

@@ -19,10 +19,7 @@ _LOG: Final = logging.getLogger("ertis_numba")
 
 
 def load_without_compiler(kernels: Iterable[Any]) -> None:
-    """Let kernels load from Numba's cache without preparing its compiler.
-
-    If a future version of Numba loads functions in another way, kernels load as Numba does it by default.
-    """
+    """Let kernels load from Numba's cache without preparing its compiler."""
     for kernel in kernels:
         cache = getattr(kernel, "_cache", None)
         if isinstance(cache, FunctionCache) and hasattr(cache, "_load_overload"):
@@ -50,11 +47,8 @@ def _warn_of_compilations(folder: str, reason: str) -> None:
 
 
 def _load(cache: Any, signature: Any, context: Any) -> Any:
-    """Return the compiled code for a signature, or None if there is none, like `FunctionCache.load_overload`.
-
-    Numba reads the types of all signatures before it compares the age of the source, so that a type which another
-    version of this package has renamed is an error of any kind. Such a cache is emptied.
-    """
+    """Return the compiled code for a signature, or None if there is none, like `FunctionCache.load_overload`."""
+    # Numba reads all types before it compares the age of the source; a cache with a renamed type is emptied.
     rtsys.initialize(context)  # registers the functions that compiled code calls
     try:
         with cache._guard_against_spurious_io_errors():  # noqa: SLF001 - Numba has no public function for this

@@ -1,8 +1,5 @@
 # mypy: ignore-errors
-"""Values of the tabulated pulse at differences of paths, without branches, so that loops over microphones are vectors.
-
-Complex numbers are pairs of float64, and tables of them have alternating real and imaginary parts.
-"""
+"""Values of the tabulated pulse at differences of paths, without branches, so that loops are vectors."""
 
 import math
 

@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Compute streams of analytic signals, and store them in 16 bits in tiles of ranges.
 
-Each tile is normalised by its largest sample. Logarithms and powers are polynomials that LLVM vectorises, with errors
-of 4e-6: the functions of the C library would take longer than the sums of the beams.
+Polynomials vectorise, with errors of 4e-6; functions of the C library would take longer than the beams.
 """
 
 import numpy as np

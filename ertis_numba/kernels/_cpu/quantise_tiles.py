@@ -10,11 +10,8 @@ __all__ = ["largest_in", "quantise_tiles"]
 
 @njit(nogil=True, cache=True)
 def largest_in(parts, begin, end, powers, bits):
-    """Return the largest magnitude in ``begin … end`` of ``parts``, (mic, phase, 2 samples) float32.
-
-    Non-negative floats have the same order as their bits. A maximum of integers is one vector instruction, while a
-    maximum of floats is a loop because of NaN. ``bits`` is a view of ``powers``.
-    """
+    """Return the largest magnitude in ``begin … end`` of ``parts``, (mic, phase, 2 samples) float32."""
+    # A maximum of bits is one vector instruction, while a maximum of floats is a loop because of NaN.
     n_mics, n_phases, _ = parts.shape
     largest = np.int32(0)
     for mic in range(n_mics):

@@ -36,10 +36,8 @@ def same_places(places):
 
 @intrinsic(prefer_literal=True)
 def prefetch_row(typing_context, out, row, first, count):
-    """Fetch ``out[row, first : first + count]`` into the cache for writing; ``count`` is a literal.
-
-    An image exceeds the cache, and the rows of consecutive directions are kilobytes apart, which no processor predicts.
-    """
+    """Fetch ``out[row, first : first + count]`` into the cache for writing; ``count`` is a literal."""
+    # No processor predicts the rows of consecutive directions, which are kilobytes apart.
     signature = types.void(out, row, types.intp, count)
     bytes_each = count.literal_value * out.dtype.bitwidth // 8
 

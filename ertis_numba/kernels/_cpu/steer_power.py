@@ -1,9 +1,5 @@
 # mypy: ignore-errors
-"""Compute the power that Hermitian matrices have for the wave from each direction.
-
-Two rows of a matrix at a time accumulate their sums in registers, so that each phase of a tile of directions is read
-for two rows.
-"""
+"""Compute the power that Hermitian matrices have for the wave from each direction."""
 
 import numpy as np
 from numba import njit, prange

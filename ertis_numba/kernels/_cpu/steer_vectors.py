@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Compute the power that vectors have for the wave from each direction.
 
-Two vectors at a time accumulate their products in registers, so that each phase of a tile of directions is read for two
-vectors. Groups of eight microphones are summed first, which reduces rounding errors to about a third.
+Groups of eight microphones are summed first, which reduces rounding errors to about a third.
 """
 
 import numpy as np

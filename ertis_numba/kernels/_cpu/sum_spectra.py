@@ -1,9 +1,7 @@
 # mypy: ignore-errors
 """Delay spectra by phase shifts, and sum them over the microphones.
 
-A vector holds successive bins. Four microphones at a time keep their phases in registers. From vector to vector, a
-complex product turns these phases. It takes a fifth of the time of a cosine and a sine, which are computed anew every
-few vectors, so that rounding errors remain below 1e-6.
+A complex product turns phases from vector to vector, in a fifth of the time of a cosine and a sine.
 """
 
 import numpy as np

@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """CPU vectors of one register, with one lane per sample: float32, float64, or int16, which only adds.
 
-Compiled code computes with them as with numbers. They stay in registers during loops, also where LLVM does not
-vectorise a loop because its sums depend on each other. Products are fused with sums if the processor can.
+They stay in registers also where LLVM does not vectorise a loop because its sums depend on each other.
 """
 
 import operator

@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Phases of the waves from a tile of directions, which keeps them in the first cache.
 
-From bin to bin, a complex product turns the phases, which are computed anew every few bins, so that rounding errors
-remain below 2e-6.
+A complex product turns them from bin to bin; anew every few bins, so that errors remain below 2e-6.
 """
 
 import numpy as np

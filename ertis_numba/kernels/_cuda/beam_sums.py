@@ -96,10 +96,8 @@ def _sum_terms(signals, offsets, weights, n_terms, direction, place):
 
 @cuda.jit(device=True)
 def fill_beams(value_of, signals, offsets, weights, n_terms, origin, first, stop, end, out):
-    """Write ``value_of(real, imag)`` of a thread's beams from ``first`` to ``stop``, and of 0 to ``end``.
-
-    The grid begins at ``first``. ``origin`` is the position in the signals of the first range of ``out``.
-    """
+    """Write ``value_of(real, imag)`` of a thread's beams from ``first`` to ``stop``, and of 0 to ``end``."""
+    # `origin` is the position in the signals of the first range of `out`.
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if direction >= np.uint64(out.shape[0]):
         return

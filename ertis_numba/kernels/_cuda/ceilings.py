@@ -1,7 +1,4 @@
-"""Performance ceilings of this GPU: kernels that measure only device memory, arithmetic or the L1 cache.
-
-They are for benchmarks, not part of the signal chain.
-"""
+"""Performance ceilings of this GPU: kernels that measure only device memory, arithmetic or the L1 cache."""
 
 from collections.abc import Callable
 from typing import Any
@@ -84,11 +81,8 @@ def properties() -> dict[str, Any]:
 def ceilings(
     runs: int, *, turns: int = _TURNS, copy_bytes: int = _COPY_BYTES, threads: int | None = None
 ) -> dict[str, float]:
-    """Return the best result of several runs, because a ceiling is not an average.
-
-    The result has ``copy_gb_s`` (bytes read and written), ``float32_gop_s`` (a multiply-add is two operations),
-    ``load_gb_s`` (L1 cache, warps aligned to cache lines) and ``load_unaligned_gb_s`` (an offset of one sample).
-    """
+    """Return the best result of several runs, because a ceiling is not an average."""
+    # `copy_gb_s` counts bytes read and written, `float32_gop_s` a multiply-add as two operations.
     threads = threads or _BLOCK * _BLOCKS_PER_MULTIPROCESSOR * properties()["multiprocessors"]
     source, target = (cuda.to_device(np.ones(copy_bytes // 4, np.float32)) for _ in range(2))
     sums = cuda.device_array(threads, np.float32)

@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Find the sources of each bin, by subtracting all sound that is coherent with the loudest direction.
 
-A round has five launches for all bins, because each step needs the results of all threads of the step before. The host
-does not wait for the end of a bin: its threads then return at once.
+A round has five launches, because each step needs the results of all threads of the step before.
 """
 
 import math

@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Multiply the roots of the microphones' signals with one another, and sum the products.
 
-Each order has its own kernel, so that the sums stay in registers. Indices that are known only at run time would force
-them into memory.
+Each order has its own kernel, so that the sums stay in registers.
 """
 
 import functools

@@ -1,8 +1,7 @@
 # mypy: ignore-errors
 """Amplitudes from delay-and-sums of streams on 16-bit samples.
 
-The sums of all streams are written to memory, because the number of streams is known only at run time, and sums in
-registers need loops of constant length. A last kernel combines them; each recipe has its own.
+The number of streams is known only at run time, and sums in registers need loops of constant length.
 """
 
 import functools

@@ -1,7 +1,6 @@
 """Copies between host and GPU that take the processor a few microseconds.
 
-Copies of Numba create several views, which takes the processor tens of microseconds. CuPy calls
-the copy of CUDA directly.
+Copies of Numba create several views, which takes the processor tens of microseconds.
 """
 
 from typing import Any

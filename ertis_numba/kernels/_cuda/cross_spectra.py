@@ -1,9 +1,5 @@
 # mypy: ignore-errors
-"""Sum the products of the spectra of each two microphones over blocks of samples.
-
-Threads of a warp handle successive bins, so that they read adjacent numbers. A block of threads has one microphone and
-all its partners.
-"""
+"""Sum the products of the spectra of each two microphones over blocks of samples."""
 
 import numpy as np
 from numba import cuda

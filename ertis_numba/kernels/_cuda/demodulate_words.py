@@ -1,8 +1,4 @@
-"""Unpack, decimate and remove the group delay in one pass over the PDM words.
-
-The threads of a warp each compute one output of up to 32 microphones. They read octets of the same word, and share one
-load of the tap.
-"""
+"""Unpack, decimate and remove the group delay in one pass over the PDM words."""
 
 import numpy as np
 from numba import cuda

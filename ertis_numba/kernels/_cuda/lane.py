@@ -28,12 +28,10 @@ Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
 
 
 class Lane:
-    """Lane of the GPU, which also provides kernels with workspace under unique names. See `kernels.Lane`.
+    """Lane of the GPU, which also provides kernels with workspace under unique names. See `kernels.Lane`."""
 
-    Launches on one stream run in order, so the next measurement can reuse the workspace. ``stream`` 0 is the default
-    stream, which synchronises with all others. With ``graphs``, `run` records its steps as a CUDA graph; without, a
-    launch takes the CPU about 50 microseconds per kernel.
-    """
+    # Launches on a stream run in order, so that measurements share the workspace. Without `graphs`, a launch takes 50
+    # µs.
 
     def __init__(
         self,

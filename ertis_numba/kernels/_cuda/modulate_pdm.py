@@ -1,7 +1,6 @@
 """Convert signals to the bits of sigma-delta modulators, with one thread per microphone.
 
-The loop is recursive in time. GPU compilers fuse a multiplication and an addition into one operation with a single
-rounding. This would change bits, so products are rounded explicitly.
+Products are rounded explicitly: a GPU compiler would fuse them with sums, which changes bits.
 """
 
 import numpy as np

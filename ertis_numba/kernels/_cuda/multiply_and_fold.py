@@ -13,11 +13,8 @@ _BLOCK = 128
 
 @cuda.jit(cache=True)
 def _fold(spectra, responses, first_bin, ahead, out):
-    """Fill one bin of ``out``.
-
-    ``ahead`` is the distance from ``first_bin`` to the next multiple of the length of ``out``. It is an argument,
-    because a remainder is expensive on a GPU.
-    """
+    """Fill one bin of ``out``."""
+    # `ahead` leads to the next multiple of the length of `out`; a remainder is expensive on a GPU.
     k = np.int64(cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x)
     if k >= out.shape[2]:
         return

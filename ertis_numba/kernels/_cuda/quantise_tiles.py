@@ -1,7 +1,4 @@
-"""Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale.
-
-There are three launches, because all threads see the largest power of each tile only after a launch has ended.
-"""
+"""Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale."""
 
 import math
 

@@ -1,9 +1,5 @@
 # mypy: ignore-errors
-"""Compute the power that Hermitian matrices have for the wave from each direction.
-
-A thread handles one direction at one bin. It computes the phase of a microphone once, in workspace, and then reads it
-for each row of the matrix. All threads of a block read the same element of the matrix at a time.
-"""
+"""Compute the power that Hermitian matrices have for the wave from each direction."""
 
 import numpy as np
 from numba import cuda

@@ -1,9 +1,7 @@
 # mypy: ignore-errors
 """Compute the power that vectors have for the wave from each direction.
 
-A thread handles one direction at one bin. It computes the phase of a microphone once, in workspace, and then reads it
-for each vector. All threads of a block read the same element of a vector at a time. Groups of eight microphones are
-summed first, which reduces rounding errors to about a third.
+Groups of eight microphones are summed first, which reduces rounding errors to about a third.
 """
 
 import numpy as np

@@ -1,7 +1,4 @@
-"""Time between marks on a lane, measured by the GPU's own clock.
-
-It is for benchmarks, not part of the signal chain.
-"""
+"""Time between marks on a lane, measured by the GPU's own clock."""
 
 from typing import Any
 

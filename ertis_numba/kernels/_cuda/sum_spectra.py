@@ -1,9 +1,5 @@
 # mypy: ignore-errors
-"""Delay spectra by phase shifts, and sum them over the microphones.
-
-As in `beam_sums`, a warp handles one direction, and each thread four bins that are a warp apart. A cosine and a sine
-per microphone give the phase of the first bin, and a complex product turns it to the next one.
-"""
+"""Delay spectra by phase shifts, and sum them over the microphones."""
 
 import numpy as np
 from numba import cuda

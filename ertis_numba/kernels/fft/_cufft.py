@@ -14,10 +14,7 @@ __all__ = ["CufftTransforms"]
 
 
 class CufftTransforms:
-    """Transforms with cuFFT, with plans, work areas and views created once, and no copies. See `Transforms`.
-
-    With phase shifts, ``analytic`` are the beams: (direction, 1, n_out).
-    """
+    """Transforms with cuFFT, with plans, work areas and views created once, and no copies. See `Transforms`."""
 
     def __init__(
         self,

@@ -41,11 +41,9 @@ _STUCK_S: Final = 5.0
 
 
 class Archive:
-    """Storage of measurements in journals, which become recordings; one archive can use a folder at a time.
+    """Storage of measurements in journals, which become recordings; one archive can use a folder at a time."""
 
-    The name is the prefix of recording names, before the time. A recording is full after ``rotate_bytes`` of data and
-    poses, or after ``rotate_s``. Without ``seal``, journals are left to ``ertis import journals``.
-    """
+    # A recording is full after `rotate_bytes` or `rotate_s`. `ertis import journals` seals journals later.
 
     def __init__(
         self,

@@ -28,11 +28,9 @@ _MAX_DUPLICATES: Final = 4096
 
 
 class JournalStore:
-    """Journals in a locked folder that store each item once and in order.
+    """Journals in a locked folder that store each item once and in order."""
 
-    An item is stored only if it follows the acknowledged ones. Up to ``acked_through``, a session is stored or known to
-    be missing; ``volume`` is the journal in use, and ``to_hand_on`` lists journals to seal.
-    """
+    # An item is stored only if it follows the acknowledged ones.
 
     def __init__(self, folder: Path, name: str, ledger: Ledger, notify: Callable[[Event], None]) -> None:
         self._folder, self._name, self._ledger, self._emit_event = folder, name, ledger, notify

@@ -117,11 +117,7 @@ class SettingsRequests:
             self._check.close()
 
     def forward(self, admin_id: bytes, request: Configure, payload: list[bytes]) -> None:
-        """Forward a checked request to the only sensor node, or refuse it.
-
-        Reasons are: no node or several send the sensor, the settings are missing or too long, too many requests are
-        open, or an equal one is.
-        """
+        """Forward a checked request to the only sensor node, or refuse it."""
         self._forget_old()
         if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
             raise Unwanted(

@@ -43,12 +43,9 @@ def sessions_in(journal: Journal) -> dict[SensorSession, int]:
 
 
 class Volume:
-    """Journal in use, owned by this object.
+    """Journal in use, owned by this object."""
 
-    ``acked`` has the highest stored number of each session. ``n_bytes`` counts data and poses. ``begun_s`` is by
-    `time.monotonic`. ``next_pose`` is the first number of `RecentPoses` that it lacks; it has the earlier poses of the
-    sensors ``posed``.
-    """
+    # `acked` has the highest stored number of each session, and `begun_s` is by `time.monotonic`.
 
     def __init__(self, journal: Journal) -> None:
         self.journal = journal
@@ -181,11 +178,9 @@ class Checksums:
 
 
 class UnrecordedGaps:
-    """Gaps of sensors without a measurement in their journal, so that its recording cannot contain them.
+    """Gaps of sensors without a measurement in their journal, so that its recording cannot contain them."""
 
-    The next recording with a measurement of the sensor contains them. Until then the ledger keeps them, so that the
-    reasons for missing numbers are never lost. A gap that is recorded twice, after a crash, is harmless.
-    """
+    # Until the next recording with a measurement of the sensor contains them, the ledger keeps them.
 
     def __init__(self, gaps: Iterable[SequenceGap]) -> None:
         self._gaps = dict.fromkeys(gaps)

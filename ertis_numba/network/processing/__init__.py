@@ -1,7 +1,4 @@
-"""Image processing: worker processes make images of measurements, and a publisher sends them to applications.
-
-Names are imported when they are first used: child processes import single modules, and start faster without the rest.
-"""
+"""Image processing: worker processes make images of measurements, and a publisher sends them to applications."""
 
 import lazy_loader
 

@@ -60,13 +60,10 @@ class _Attempt:
 
 
 class Cluster:
-    """`Runner` whose jobs run on the workers of a dask scheduler, at the address options.workers.
+    """`Runner` whose jobs run on the workers of a dask scheduler, at the address options.workers."""
 
-    Workers need the same version of this package. Each has as many jobs under way as threads: with more, each took 30
-    ms instead of 23 ms at the same throughput. A worker that misses the deadline or loses its connection gets no jobs
-    until it is reached again. Anyone who reaches a scheduler can run code on its workers: keep it among trusted
-    machines, or use dask's TLS. ``respawned`` counts workers that have left, or did not answer.
-    """
+    # More jobs per worker than threads took 30 ms each instead of 23 ms, at the same throughput. Anyone who reaches a
+    # scheduler can run code on its workers.
 
     def __init__(self, options: ProcessingOptions, log: Callable[[str], None]) -> None:
         self._options, self._log = options, log

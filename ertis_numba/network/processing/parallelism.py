@@ -59,12 +59,10 @@ class Mode:
 
 
 class Choice:
-    """Choice of one measurement on all cores, or several at once, by measured times and load.
+    """Choice of one measurement on all cores, or several at once, by measured times and load."""
 
-    One measurement on all cores is done soonest. Several at once, with a share of the cores each, have a higher
-    throughput, and wait less for each other if they arrive in bursts, as from sensors on a common SYNC line. ``modes``
-    are one at a time, then 2, 4, 8 and so on, up to the number of workers. ``threads`` are those of all workers.
-    """
+    # One on all cores is done soonest; several at once have a higher throughput, and suit bursts. `modes` are one at a
+    # time, then 2, 4, 8 and so on.
 
     def __init__(self, workers: int, threads: int) -> None:
         powers = [2**power for power in range(workers.bit_length())]

@@ -41,10 +41,7 @@ class RegisteredSensor:
 
 
 class Sensors:
-    """All sensors; those with equal settings share a kind, and therefore a pipeline.
-
-    ``describe`` is called with a description before the first product, and ``prepare`` with each new kind.
-    """
+    """All sensors; those with equal settings share a kind, and therefore a pipeline."""
 
     def __init__(
         self,
@@ -87,12 +84,8 @@ class Sensors:
         self._describe_images(known)
 
     def kind_of(self, data: Data) -> JobKind | None:
-        """Return the kind of a measurement, None if it cannot be processed, as without a call.
-
-        Air determines ranges, and therefore the kind. A new kind needs a difference of 0.5 °C, 5 % or 1 kPa, because a
-        pipeline cannot be made for each measurement of a warming day. The resulting error of ranges at 20 °C is at most
-        0.09 % for temperature, 0.02 % for humidity and 0.003 % for pressure: 6 mm at 5 m for all together.
-        """
+        """Return the kind of a measurement, None if it cannot be processed, as without a call."""
+        # A new kind needs a difference of 0.5 °C, 5 % or 1 kPa: ranges are wrong by at most 6 mm at 5 m.
         known = self._known[data.sensor]
         if is_passive(known.applied or known.settings, data.stamp):
             return known.passive

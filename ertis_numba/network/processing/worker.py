@@ -21,11 +21,9 @@ _DELAYS_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)
 
 
 class Worker(SupervisedProcess[FromWorker]):
-    """Supervised worker process.
+    """Supervised worker process."""
 
-    It reports when it is ``ready``. Of its ``slots``, ``free`` ones are empty, and ``slot`` is that of the ``job``,
-    like ``mode``. ``kinds`` have a pipeline, it prepares for ``preparing``, and ``done`` counts finished jobs.
-    """
+    # `free` of its `slots` are empty. `kinds` have a pipeline, and `done` counts finished jobs.
 
     def __init__(self, number: int) -> None:
         super().__init__(_MODULE, FromWorker, _DELAYS_S)

@@ -45,10 +45,9 @@ _TRIES: Final = 3  # Limit on workers that die while preparing for a kind that h
 
 
 class LocalWorkerPool:
-    """`Runner` whose jobs run in processes of this machine; one that misses its deadline is killed.
+    """`Runner` whose jobs run in processes of this machine; one that misses its deadline is killed."""
 
-    Each worker has its own pipe and two slots, so that its death at any time costs only its job.
-    """
+    # Each worker has its own pipe and two slots, so that its death at any time costs only its job.
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
         self._options, self._log = options, log

@@ -127,10 +127,8 @@ class _ImageWorker:
 
 
 def end_after(time_s: float) -> None:
-    """End this process after a time, with a traceback on stderr; 0 cancels that.
-
-    A timer of the system costs a hundredth of `faulthandler.dump_traceback_later`, which starts a thread.
-    """
+    """End this process after a time, with a traceback on stderr; 0 cancels that."""
+    # A timer of the system costs a hundredth of `faulthandler.dump_traceback_later`.
     if hasattr(signal, "setitimer"):
         _arm()
         signal.setitimer(signal.ITIMER_REAL, time_s)

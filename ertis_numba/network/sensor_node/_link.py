@@ -36,11 +36,7 @@ _WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refuse
 
 
 class Link(threading.Thread):
-    """Thread that sends a spool's items, and reconnects until it is stopped; its functions must not raise.
-
-    Without ``on_settings``, requests for new settings are refused. ``central`` is its last reported state, and
-    ``reconnects`` counts reconnections after it was away.
-    """
+    """Thread that sends a spool's items, and reconnects until it is stopped; its functions must not raise."""
 
     def __init__(
         self,

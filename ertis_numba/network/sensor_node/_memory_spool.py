@@ -43,10 +43,7 @@ class SensorCounts:
 
 
 class Spool:
-    """Measurements in memory up to max_bytes; the oldest become gaps if there is no more room.
-
-    ``turn`` is the lock of `runs`, oldest first, and `counts`; each acknowledgement notifies its condition ``acked``.
-    """
+    """Measurements in memory up to max_bytes; the oldest become gaps if there is no more room."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = checks.integer("ring_bytes", max_bytes, 1)

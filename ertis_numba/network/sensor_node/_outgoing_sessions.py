@@ -32,10 +32,7 @@ class UnackedItem:
 
 @dataclass(slots=True, eq=False)
 class OutgoingSession:
-    """Items of one session of a sensor, oldest first, with a send window: go-back-N; one thread at a time.
-
-    Positions are numbers, so that items may be moved or replaced meanwhile.
-    """
+    """Items of one session of a sensor, oldest first, with a send window: go-back-N; one thread at a time."""
 
     sensor: JournalSensor
     session_id: int

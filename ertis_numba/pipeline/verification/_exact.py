@@ -30,11 +30,7 @@ _RINGING = 100.0  # The ringing of a raised cosine of width w is below -160 dB a
 
 
 class ExactImage:
-    """The exact counterpart of an image of a measurement, computed direction by direction from its axes and settings.
-
-    ``operations_per_direction`` estimates the complex multiplications. A cleaned image raises ArgumentError, because it
-    has no exact counterpart.
-    """
+    """The exact counterpart of an image of a measurement, computed by direction from its axes and settings."""
 
     def __init__(self, image: Energyscape, measurement: Measurement) -> None:
         settings = self._settings = image.settings

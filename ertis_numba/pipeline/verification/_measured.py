@@ -99,11 +99,9 @@ def error_db(amplitude: NDArray[np.floating], exact: NDArray[np.floating]) -> fl
 
 
 def sampled(power: NDArray[np.float64], count: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return a sample of items, and their weights in an estimate of the sum over all items.
-
-    Half of the probability is uniform, and half is proportional to power. Neighbours are alike, so systematic sampling
-    at equal steps of the cumulative probability has a smaller error than random sampling.
-    """
+    """Return a sample of items, and their weights in an estimate of the sum over all items."""
+    # Half of the probability is uniform, and half is proportional to power. Sampling is systematic: neighbours are
+    # alike.
     total = float(power.sum())
     even = np.full(len(power), 1 / len(power))
     probability = (even + power / total) / 2 if 0 < total < math.inf else even

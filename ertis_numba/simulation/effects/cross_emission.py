@@ -10,11 +10,7 @@ __all__ = ["estimate", "other_emitters"]
 
 
 def other_emitters(shot: Snapshot) -> list[int]:
-    """Return the indices of the other sensors that emit.
-
-    All sensors emit at the same time. The call of another sensor follows a bistatic path from its emitter over a target
-    to the microphones.
-    """
+    """Return the indices of the other sensors that emit."""
     return [
         number
         for number, sensor in enumerate(shot.scene.sensors)

@@ -113,10 +113,7 @@ def _sent_s(source: SourceInScene[Noise] | SourceInScene[Sonar] | SourceInScene[
 
 
 def _calls_of(source: SourceInScene[Sonar] | SourceInScene[AnySource], sonar: Sonar) -> Floats:
-    """Return the start times (call,) of another sonar's calls that may arrive during the record, often negative.
-
-    Echoes of these calls from targets are far weaker than the direct sound, and are not modelled.
-    """
+    """Return the start times (call,) of another sonar's calls that may arrive during the record, often negative."""
     if not len(source.paths):
         return np.zeros(0)
     time_s = source.shot.time_s
