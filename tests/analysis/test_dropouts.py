@@ -7,7 +7,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.analysis.health import health
-from ertis_numba.analysis.sample_faults import SampleFaults, _still_parts, dropouts
+from ertis_numba.analysis.sample_faults import SampleFaults, _still_parts, constant_parts, dropouts
 from ertis_numba.analysis.sound_checks import SoundChecks
 from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Call, Passive, Processing, Recording, Settings
@@ -199,3 +199,38 @@ def test_still_parts_across_pieces_are_those_of_the_whole_record(first):
     rows[first : first + 300] = 0
     changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1))
     assert _still_parts(rows, 100) == ([(first, first + 300)], len(changes))
+
+
+def drawn(rng, kind, n_mics):
+    """Sound of one kind, by its own generator and not by the simulator, at 16 bits, 24 bits or single precision."""
+    signals, level = rng.standard_normal((N_SAMPLES, n_mics)), 10 ** (rng.uniform(-85, -20) / 20)
+    if kind == "low-pass noise":
+        keep = np.arange(N_SAMPLES // 2 + 1)[:, None] < rng.uniform(0.02, 0.5) * N_SAMPLES / 2
+        signals = np.fft.irfft(np.fft.rfft(signals, axis=0) * keep, axis=0)
+        signals /= signals.std()
+    elif kind == "tone":
+        rad = 2 * np.pi * rng.uniform(0.001, 0.4) * np.arange(N_SAMPLES)[:, None] + rng.uniform(0, 6.28, n_mics)
+        signals = 0.01 * signals + np.sin(rad)
+    elif kind == "clipped noise":
+        signals, level = np.clip(rng.uniform(0.5, 20) * signals, -1, 1), 1.0
+    return scaled(signals * level, rng.choice([15, 23, 0]))
+
+
+def scaled(signals, bits):
+    """Integers of a number of bits behind the sign, or floating point for 0."""
+    if not bits:
+        return signals.astype(np.float32)
+    return np.clip(np.round(signals * 2**bits), -(2**bits), 2**bits - 1).astype(np.int32)
+
+
+@pytest.mark.parametrize("kind", ["white noise", "low-pass noise", "tone", "clipped noise"])
+def test_dropouts_of_drawn_sound_are_found_where_they_are_and_nowhere_else(kind):
+    rng, n_found, n_draws = np.random.default_rng(4711), 0, 150
+    for _ in range(n_draws):
+        signals = drawn(rng, kind, n_mics := int(rng.choice([1, 4, 8])))
+        assert constant_parts(signals, np.arange(n_mics), is_pdm=False) == []
+        first, length = int(rng.integers(100, N_SAMPLES - 1600)), int(np.exp(rng.uniform(np.log(36), np.log(1500))))
+        found = constant_parts(cut(signals, first, first + length), np.arange(n_mics), is_pdm=False)
+        n_found += any(abs(a - first) <= 4 and abs(b - first - length) <= 4 for a, b in found)
+    # A dropout that begins where nothing changes, as in clipped sound, cannot be told from the sound.
+    assert n_found >= (0.3 if kind == "clipped noise" else 0.92) * n_draws
