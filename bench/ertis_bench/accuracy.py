@@ -30,17 +30,7 @@ drifts meanwhile.
 
 
 def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS) -> dict[str, Any]:
-    """Measure error and time of all plans on each subject, and return the report.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per plan.
-    say : callable
-        Called with a line of progress.
-    directions : str
-        Direction grid, as ``processing.directions``.
-    """
+    """Measure error and time of all plans on each subject, and return the report."""
     kernel_set = kernels.load("cpu")
     found, left_out = _subjects(say)
     rows, sources = [], []

@@ -19,13 +19,7 @@ _SAME_LEVEL_DB = 1.5
 
 
 def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db: float = MAX_ERROR_DB) -> float:
-    """Return the error of an image in dB, measured in some directions.
-
-    Raises
-    ------
-    DataError
-        The error exceeds ``max_error_db``.
-    """
+    """Return the error of an image in dB, measured in some directions."""
     chosen = np.unique(np.linspace(0, len(image.amplitude) - 1, _N_DIRECTIONS + 2).astype(int)[1:-1])
     exact = ExactImage(image, measurement)
     ranges = np.arange(image.amplitude.shape[1])
@@ -36,13 +30,7 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
 
 
 def require_error(error_db: float, name: str, *, max_error_db: float = MAX_ERROR_DB) -> float:
-    """Return the error of a named image in dB, relative to the exact image.
-
-    Raises
-    ------
-    DataError
-        The error exceeds ``max_error_db``.
-    """
+    """Return the error of a named image in dB, relative to the exact image."""
     if not error_db <= max_error_db:
         raise DataError(
             f"{name} has an error of {error_db:.1f} dB relative to the exact image; the limit is {max_error_db:g} dB. "
@@ -55,11 +43,6 @@ def require_same_reflector(image: Energyscape, other: Energyscape) -> None:
     """Require the strongest bin of one image to be among the strongest of the other, at nearly the same place.
 
     Methods sample pulses differently, so two reflectors of nearly equal level may change ranks.
-
-    Raises
-    ------
-    DataError
-        The other image is weak at that place.
     """
     direction, distance = np.unravel_index(np.argmax(image.amplitude), image.amplitude.shape)
     vectors = unit_vectors(other.azimuth_rad, other.elevation_rad)

@@ -25,25 +25,13 @@ def or_dash(value: float | None, digits: int) -> str:
 
 
 def update(path: Path, marker: str, text: str) -> None:
-    """Replace the text between ``<!-- MARKER -->`` and ``<!-- /MARKER -->`` in a file.
-
-    Raises
-    ------
-    ArgumentError
-        The file cannot be read, or does not contain the markers.
-    """
+    """Replace the text between ``<!-- MARKER -->`` and ``<!-- /MARKER -->`` in a file."""
     head, tail = around(path, marker)
     path.write_text(f"{head}\n{text.strip()}\n{tail}", encoding="utf-8")
 
 
 def around(path: Path, marker: str) -> tuple[str, str]:
-    """Return a file's text up to the end of the first marker, and from the second marker on.
-
-    Raises
-    ------
-    ArgumentError
-        As in `update`. Callers can therefore refuse a file before they measure.
-    """
+    """Return a file's text up to the end of the first marker, and from the second marker on."""
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     try:
         content = path.read_text("utf-8")
@@ -61,11 +49,6 @@ def place(path: Path, program: str, forms: Iterable[str], parts: Sequence[str] =
 
     Selected parts of a benchmark have their own markers, ``PROGRAM FORM --only PART``, so that they never replace the
     table of all parts.
-
-    Raises
-    ------
-    ArgumentError
-        As in `around`.
     """
     markers = {form: " ".join([program, form, *(f"--only {part}" for part in parts)]) for form in forms}
     first, *others = markers

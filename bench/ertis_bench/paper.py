@@ -46,20 +46,7 @@ PUBLISHED_MS = {
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure all backends, and return a report with machine, rows and conditions.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per backend and number of directions.
-    say : callable
-        Called with a line of progress.
-
-    Raises
-    ------
-    DataError
-        A result is wrong and therefore not timed.
-    """
+    """Measure all backends, and return a report with machine, rows and conditions."""
     measurement, source = input_measurements.measurement()
     with one_thread():
         rows, errors_db = _measure(measurement, count, say)

@@ -33,22 +33,7 @@ def _combinations() -> list[tuple[BeamformerName, WeightingName, int | None]]:
 
 
 def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS) -> dict[str, Any]:
-    """Measure error and time of each combination on one thread, and return the report.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per combination.
-    say : callable
-        Called with a line of progress.
-    directions : str
-        Direction grid, as ``processing.directions``.
-
-    Raises
-    ------
-    DataError
-        The error of an image exceeds -20 dB, or its budget without a warning.
-    """
+    """Measure error and time of each combination on one thread, and return the report."""
     measurement, source = input_measurements.real() or input_measurements.measurement()
     settings = measurement.settings.replace("processing.directions", directions).replace(
         "processing.wavefront", "plane"

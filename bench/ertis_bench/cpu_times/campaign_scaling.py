@@ -30,21 +30,7 @@ _CREATED_S: Final = "1700000000"
 
 
 def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Process the same recordings with each configuration in turns, compare all files, and return the report.
-
-    Parameters
-    ----------
-    count : int
-        Recordings.
-    rounds : int
-    say : callable
-        Called with a line of progress.
-
-    Raises
-    ------
-    DataError
-        A recording failed, an image is wrong, or files differ.
-    """
+    """Process the same recordings with each configuration in turns, compare all files, and return the report."""
     before = os.environ.get("SOURCE_DATE_EPOCH")
     os.environ["SOURCE_DATE_EPOCH"] = _CREATED_S
     try:

@@ -40,16 +40,6 @@ def run(*, count: int, say: Callable[[str], None], units: Collection[str] = UNIT
     """Measure the costs of each device several times, and return the medians of the fastest third.
 
     The CPU is also measured with each older instruction set. Costs of NEON are derived from those of SSE2.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per device.
-    say : callable
-        Called with a line of progress.
-    units : collection of str
-        Units to measure; all by default. If they are not all, their costs are scaled to the machine of the nominal
-        costs, by the cost of a sum here and there.
     """
     is_whole = set(units) == set(UNITS)
     measured = units if is_whole else (*units, _REFERENCE)

@@ -40,20 +40,7 @@ _STRANDS_PER_THREAD = 8
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure all series on device ``cpu``, and the ceilings.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per value.
-    say : callable
-        Called with a line of progress.
-
-    Raises
-    ------
-    DataError
-        A result is wrong and therefore not timed.
-    """
+    """Measure all series on device ``cpu``, and the ceilings."""
     rows = []
     for series, plan in _series():
         say(f"{series}, {plan}: checking and timing {count} measurements each")
@@ -151,14 +138,6 @@ def reached(rows: list[dict[str, Any]], precision: str, ceiling: dict[str, float
 
     Its time per direction is the slope of a line through the times over directions. The intercept of the line is the
     time of the rest of the chain, which does not depend on the number of directions.
-
-    Parameters
-    ----------
-    rows : list of dict
-        Measured rows. Only those of the series ``directions`` without a beam grid at this precision are used.
-    precision : {"float32", "int16"}
-    ceiling : dict
-        Limits of the machine with the same number of threads.
     """
     points = [row for row in rows if (row["series"], row["plan"]) == ("directions", precision)]
     directions = np.array([row["value"] for row in points])

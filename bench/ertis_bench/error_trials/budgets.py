@@ -53,17 +53,7 @@ _GROUPS: dict[str, Callable[[dict[str, Any]], bool]] = {
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Process ``count`` random recordings through the command line, and return the report.
-
-    Parameters
-    ----------
-    count : int
-        Number of settings that have a plan and an image that is not silent.
-    seed : int
-        Seed of the first setting. Later settings use the following seeds.
-    say : callable
-        Called with a line of progress for each recording.
-    """
+    """Process ``count`` random recordings through the command line, and return the report."""
     rows: list[dict[str, Any]] = []
     refused = 0
     each = seed

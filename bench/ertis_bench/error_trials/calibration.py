@@ -24,19 +24,7 @@ _TWO_SIDED_95 = 1.96
 
 
 def run(*, count: int, healthy: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Calibrate arrays with random errors and faults, and arrays without faults.
-
-    Parameters
-    ----------
-    count : int
-        Number of arrays with faults.
-    healthy : int
-        Number of arrays without faults, but with the same errors.
-    seed : int
-        Seed of the first array.
-    say : callable
-        Function that reports progress.
-    """
+    """Calibrate arrays with random errors and faults, and arrays without faults."""
     errors, deviations, losses, before, seconds, found = [], [], [], [], [], 0
     for number in range(seed, seed + count):
         array = faulty_array(number)

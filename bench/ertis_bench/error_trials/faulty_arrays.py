@@ -54,14 +54,7 @@ class FaultyArray:
 
 
 def faulty_array(seed: int, *, healthy: bool = False) -> FaultyArray:
-    """Return an array with random gains, delays and positions, and, unless healthy, with random faults.
-
-    Parameters
-    ----------
-    seed : int
-    healthy : bool
-        True for an array without swapped, dead and inverted channels.
-    """
+    """Return an array with random gains, delays and positions, and, unless healthy, with random faults."""
     rng = np.random.default_rng(seed)
     layout = load_layout(LAYOUT)
     n = len(layout.enabled)
@@ -82,18 +75,7 @@ def faulty_array(seed: int, *, healthy: bool = False) -> FaultyArray:
 
 
 def record(array: FaultyArray, seed: int, count: int, *, noise_dbfs: float = -50.0) -> list[Measurement]:
-    """Return recordings of a reflector at random places, with the settings of the layout.
-
-    Parameters
-    ----------
-    array : FaultyArray
-    seed : int
-        Seed of the places and of the noise.
-    count : int
-        Number of recordings.
-    noise_dbfs : float
-        Noise of each microphone.
-    """
+    """Return recordings of a reflector at random places, with the settings of the layout."""
     rng = np.random.default_rng((seed, 1))
     real = Array(
         layout="real",
@@ -153,13 +135,6 @@ def image_losses(array: FaultyArray, made: Calibration, *, calibrated: bool = Tr
 
     Beams for nine directions are computed for plane waves at nine frequencies of the call, and their powers are added.
     Side lobes are maxima of the pattern outside its main lobe, within 60° of azimuth and 40° of elevation.
-
-    Parameters
-    ----------
-    array : FaultyArray
-    made : Calibration
-    calibrated : bool
-        False for the layout before the calibration.
     """
     channels = list(made.channels)
     layout = made.layout if calibrated else made.former

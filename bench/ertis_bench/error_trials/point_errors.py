@@ -36,15 +36,7 @@ _AMPLITUDE = 0.01
 
 
 class Trials:
-    """Echoes of points at random positions in noise, as spherical waves in air that absorbs, and errors of the points.
-
-    Parameters
-    ----------
-    directions : str
-        Direction grid, as in `Processing`.
-    max_error_db : float
-        Error budget of the images.
-    """
+    """Echoes of points at random positions in noise, as spherical waves in air that absorbs, and their errors."""
 
     def __init__(self, directions: str, max_error_db: float) -> None:
         self._is_planar = directions.startswith("2d")
@@ -73,14 +65,7 @@ class Trials:
         self._noise = self._image(self._echo(np.array([1.0, 0.0, 0.0]), 0.85)).max() / math.sqrt(np.mean(noise**2))
 
     def standardised_errors(self, ratio: float, count: int, seed: int) -> NDArray[np.float64]:
-        """Return errors along range, across it and of the level, in reported standard deviations: (point, 3) float64.
-
-        Parameters
-        ----------
-        ratio : float
-            Amplitude of the echo relative to the root mean square of the image's noise.
-        count, seed : int
-        """
+        """Return errors along range, across it and of the level, in reported standard deviations: (point, 3)."""
         rng = np.random.default_rng(seed)
         return np.array([self._standardised_error(ratio, rng) for _ in range(count)])
 
@@ -137,16 +122,7 @@ class Trials:
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure the share of ``count`` points within their uncertainty, for each grid, budget and level.
-
-    Parameters
-    ----------
-    count : int
-        Points per cell.
-    seed : int
-    say : callable
-        Called with a line for each cell.
-    """
+    """Measure the share of ``count`` points within their uncertainty, for each grid, budget and level."""
     rows = []
     for directions in GRIDS:
         for budget_db in BUDGETS_DB:

@@ -60,11 +60,6 @@ def random_settings(random: np.random.Generator, limits: DrawLimits) -> Settings
     """Return valid and complete settings.
 
     They cover short calls, calls without ramps, PDM and PCM, and every beamformer.
-
-    Raises
-    ------
-    ArgumentError
-        No settings within the limits are valid.
     """
     refused = ""
     for _ in range(_DRAWS):

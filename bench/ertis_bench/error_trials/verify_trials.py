@@ -46,16 +46,7 @@ _GROUPS: dict[str, Callable[[Settings], bool]] = {
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Compare verified and true errors of ``count`` random settings, and return the report.
-
-    Parameters
-    ----------
-    count : int
-    seed : int
-        Seed of the first setting. Later settings use the following seeds.
-    say : callable
-        Called with a line of progress.
-    """
+    """Compare verified and true errors of ``count`` random settings, and return the report."""
     rows = []
     for each in range(seed, seed + count):
         rows.append(compared(each))

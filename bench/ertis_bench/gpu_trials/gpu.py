@@ -88,15 +88,7 @@ _MAX_REPORTED = 20  # names of failed tests
 
 @dataclass(frozen=True, slots=True)
 class FinishedProcess:
-    """Result of a process.
-
-    Attributes
-    ----------
-    code : int or None
-        Exit code, or None after a timeout.
-    text : str
-        Output on stdout and stderr.
-    """
+    """Result of a process."""
 
     code: int | None
     text: str
@@ -108,22 +100,7 @@ class FinishedProcess:
 
 
 def run(*, results: Path, say: Callable[[str], None], measure: bool = True) -> dict[str, Any]:
-    """Measure, write the results to a new file, and return them.
-
-    Parameters
-    ----------
-    results : Path
-        Folder of the new file, whose name contains the GPU and the time.
-    say : callable
-        Called with a line of progress.
-    measure : bool
-        If False, measure nothing and return the newest results of the folder, or an empty report.
-
-    Raises
-    ------
-    DeviceError
-        There is no GPU, or only a simulated one. Nothing is written then.
-    """
+    """Measure, write the results to a new file, and return them."""
     if not measure:
         return newest(results)
     started_s = time.monotonic()

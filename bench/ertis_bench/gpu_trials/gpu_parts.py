@@ -106,13 +106,7 @@ FULL = Scale()
 
 
 def machine(_: Scale) -> Iterator[dict[str, Any]]:
-    """Yield the properties of the GPU.
-
-    Raises
-    ------
-    DeviceError
-        There is no GPU, or only a simulated one.
-    """
+    """Yield the properties of the GPU."""
     kernel_set = kernels.load("cuda")
     if kernel_set.simulated:
         raise DeviceError("device 'cuda' is simulated here, so its times are meaningless; unset NUMBA_ENABLE_CUDASIM")
@@ -135,11 +129,6 @@ def paper(scale: Scale) -> Iterator[dict[str, Any]]:
     """Yield one row per direction grid, with times of single measurements, stages and streams.
 
     Images are checked before they are timed.
-
-    Raises
-    ------
-    DataError
-        A result is wrong and therefore not timed.
     """
     for directions in scale.directions:
         settings, measurement = scale.settings(directions)
@@ -251,13 +240,7 @@ PARTS: dict[str, Callable[[Scale], Iterator[dict[str, Any]]]] = {
 
 
 def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> dict[str, float]:
-    """Return the error relative to the exact image, and the difference from the CPU's image of the same plan.
-
-    Raises
-    ------
-    DataError
-        An error is too large, or a CUDA graph changes the image.
-    """
+    """Return the error relative to the exact image, and the difference from the CPU's image of the same plan."""
     image = plain.process(measurement)
     again = [
         recorded.process(measurement) for _ in range(3)

@@ -44,16 +44,7 @@ def settings_for(settings: Settings) -> Settings:
 
 
 def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[dict[str, Any], NDArray[np.float32]]:
-    """Return the arguments of ``mach.kernel.beamform`` with NumPy arrays, and this package's image.
-
-    Parameters
-    ----------
-    settings : Settings
-        Complete settings.
-    measurement : Measurement
-    device : str
-        Device that computes the image and the analytic signals.
-    """
+    """Return the arguments of ``mach.kernel.beamform`` with NumPy arrays, and this package's image."""
     chain = FastChain(settings, kernels.load(device), threads=1)
     image = chain.new_image()
     words = measurement.data.reshape(settings.recording.n_samples, -1)
@@ -86,13 +77,7 @@ def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[
 
 
 def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, Any]:
-    """Return times of mach and of this package for delay-and-sum with envelope, entirely on the GPU.
-
-    Raises
-    ------
-    DataError
-        The images differ.
-    """
+    """Return times of mach and of this package for delay-and-sum with envelope, entirely on the GPU."""
     import cupy  # noqa: PLC0415 - there with a GPU only
     from mach.kernel import beamform  # noqa: PLC0415 - rarely there
 

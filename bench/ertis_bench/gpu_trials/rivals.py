@@ -240,11 +240,6 @@ def race(library: str, settings: Settings, measurement: Measurement, count: int)
     """Return times of a library and of this package for the same sums, from host to host.
 
     mach is compared for delay-and-sum only.
-
-    Raises
-    ------
-    DataError
-        The images differ.
     """
     if library == "mach":
         return rival_mach.race(settings, measurement, count)

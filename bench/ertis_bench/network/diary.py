@@ -34,13 +34,7 @@ class Row(NamedTuple):
 
 
 class Diary:
-    """Diary of a sender, one JSON line per event.
-
-    Parameters
-    ----------
-    path : Path
-        File that is appended to.
-    """
+    """Diary of a sender, one JSON line per event."""
 
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)

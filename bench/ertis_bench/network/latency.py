@@ -42,16 +42,7 @@ _ACKS: Final = {
 
 
 def run(*, say: Callable[[str], None], duration_s: float = 30.0, seed: int = 1) -> dict[str, Any]:
-    """Process measurements without and with storage, then from a serial line, and return the times of all stages.
-
-    Parameters
-    ----------
-    say : callable
-        Called with a line of progress.
-    duration_s : float
-        Duration of each run.
-    seed : int
-    """
+    """Process measurements without and with storage, then from a serial line, and return the times of all stages."""
     cases = {}
     for name, stores in (("images", False), ("images and storage", True)):
         say(f"{name}: 90 directions, 4 sensors × 10 Hz")

@@ -27,21 +27,7 @@ Event = dict[str, Any]
 
 
 class JsonLinesProcess:
-    """Process that reports events as lines of JSON on stdout; use it in a ``with`` statement.
-
-    Parameters
-    ----------
-    command : sequence of str
-    stated : Path
-        File to which stderr is appended.
-    mark : str
-        Mark by which `survivors` finds the process and its children.
-
-    Attributes
-    ----------
-    events : list of dict
-        Events so far.
-    """
+    """Process that reports events as lines of JSON on stdout; use it in a ``with`` statement."""
 
     def __init__(self, command: Sequence[str], *, stated: Path, mark: str = "") -> None:
         paths = os.pathsep.join(filter(None, sys.path))
@@ -76,13 +62,7 @@ class JsonLinesProcess:
             self._news.notify_all()
 
     def wait_for(self, name: str, *, timeout_s: float = _WAIT_S, since: int = 0) -> Event:
-        """Return the first event with a name, after skipping ``since`` of them.
-
-        Raises
-        ------
-        DataError
-            The event did not arrive in time.
-        """
+        """Return the first event with a name, after skipping ``since`` of them."""
         end_s = time.monotonic() + timeout_s
         with self._news:
             while True:
@@ -128,13 +108,7 @@ class JsonLinesProcess:
         return self.wait(timeout_s=timeout_s)
 
     def wait(self, *, timeout_s: float = _WAIT_S) -> int:
-        """Wait until the process has ended, and return its exit code.
-
-        Raises
-        ------
-        DataError
-            The process does not end in time.
-        """
+        """Wait until the process has ended, and return its exit code."""
         try:
             code = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
@@ -200,19 +174,7 @@ def central(
     mark: str = "",
     ertis: Sequence[str] = ERTIS,
 ) -> JsonLinesProcess:
-    """Start ``ertis record`` or ``ertis serve``, with stderr in ``central.txt`` of a folder.
-
-    Parameters
-    ----------
-    command : {"record", "serve"}
-    folder : Path
-        Folder of the trial.
-    *options : str
-    listen : str
-    mark : str
-    ertis : sequence of str
-        Command that runs ``ertis``.
-    """
+    """Start ``ertis record`` or ``ertis serve``, with stderr in ``central.txt`` of a folder."""
     line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
     return JsonLinesProcess(line, stated=folder / "central.txt", mark=mark)
 

@@ -11,13 +11,7 @@ _ZMQ = "ZMQbg"  # Beginning of the names of ZeroMQ's threads, which encrypt, dec
 
 
 class ProcessorTime:
-    """Processor time that processes use from now on.
-
-    Parameters
-    ----------
-    processes : mapping of str to sequence of int
-        Process ids by name.
-    """
+    """Processor time that processes use from now on."""
 
     def __init__(self, processes: Mapping[str, Sequence[int]]) -> None:
         self._processes = processes

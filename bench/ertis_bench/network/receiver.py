@@ -65,19 +65,7 @@ class ReceiverJob:
 
 @dataclass(slots=True)
 class Received:
-    """Results of a receiver.
-
-    Attributes
-    ----------
-    times_ms : dict of DiaryKey to float
-        Time from the arrival of each measurement at the sensor node until the receiver has its image.
-    twice, disordered, wrong : int
-        Images that came again, images whose number does not rise, and images with wrong values.
-    numbers : list of int
-        Numbers of all products.
-    dropped : int
-        Number of dropped products, as the publisher reported it with the last one.
-    """
+    """Results of a receiver."""
 
     times_ms: dict[DiaryKey, float] = field(default_factory=dict)
     twice: int = 0

@@ -132,16 +132,7 @@ def _print_event(**event: object) -> None:
 
 @dataclass(slots=True)
 class Sender:
-    """Sensor node that writes a diary.
-
-    Attributes
-    ----------
-    job : SenderJob
-    emit : callable
-        Called with the fields of each event, which are printed by default.
-    stopped : bool
-        Set it to end the measurements.
-    """
+    """Sensor node that writes a diary."""
 
     job: SenderJob
     emit: Callable[..., None] = _print_event

@@ -69,17 +69,7 @@ def percentile(times_ms: Sequence[float], share: float) -> float:
 
 @dataclass(slots=True)
 class Serve:
-    """``ertis serve`` with its output; use it in a ``with`` statement of `running`.
-
-    Attributes
-    ----------
-    node : JsonLinesProcess
-    listen, publish : str
-    mark : str
-    unbalanced : int
-        Number of statuses in which received measurements differ from published, dropped and waiting ones.
-    latest : Status or None
-    """
+    """``ertis serve`` with its output; use it in a ``with`` statement of `running`."""
 
     node: JsonLinesProcess
     listen: str
@@ -125,12 +115,6 @@ class Serve:
         """Wait until an application has received all published images, or learned that they were skipped for it.
 
         After a timeout, the counts of the application show which images are missing.
-
-        Parameters
-        ----------
-        images : Path
-            Diary of the application, which has received images since the start of the central node.
-        timeout_s : float
         """
         published = 0 if self.latest is None else sum(each.published for each in self.latest.sensors.values())
 

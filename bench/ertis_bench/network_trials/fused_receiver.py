@@ -25,16 +25,7 @@ _CHECKED: Final = 10  # Of the fused pulses with points, one in so many is kept,
 
 
 class FusedPulse(NamedTuple):
-    """Line of the diary.
-
-    Attributes
-    ----------
-    sync_count : int
-    n_images : int
-        Images that were fused.
-    first_ns, ready_ns, located_ns : int
-        Arrival of the last byte at the sensor node, end of the fusion, and end of the computation of its points.
-    """
+    """Line of the diary."""
 
     sync_count: int
     n_images: int

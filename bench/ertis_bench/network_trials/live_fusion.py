@@ -37,13 +37,6 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
     """Fuse the images of four sensors in an application that starts while the central node serves.
 
     Its pipelines exist before; the kernels and tables of the fusion do not.
-
-    Parameters
-    ----------
-    folder : Path
-    duration_s : float
-    seed : int
-        Seed of the reflectors.
     """
     scene = platform_scene(seed, random_reflectors(seed), EMITTERS_M[0])
     scene = scene.replace(sensors=tuple(each.replace(processing=SETTINGS.processing) for each in scene.sensors))
@@ -125,13 +118,7 @@ def _rendered(scene: Scene, folder: Path) -> tuple[Path, Path]:
 
 
 def _warm_up(serve: Serve, job: SenderJob) -> None:
-    """Let the central node create its pipelines: send measurements until it publishes images.
-
-    Raises
-    ------
-    DataError
-        It does not.
-    """
+    """Let the central node create its pipelines: send measurements until it publishes images."""
     for _ in range(_TRIES):
         with job.start() as sender:
             sender.wait_for("sent", timeout_s=120.0)

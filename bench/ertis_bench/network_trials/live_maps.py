@@ -26,15 +26,7 @@ Found = dict[str, Any]
 
 
 def measure(folder: Path, duration_s: float, seed: int) -> Found:
-    """Show the acoustic maps of four sensors that emit no calls, in a view without a browser.
-
-    Parameters
-    ----------
-    folder : Path
-    duration_s : float
-    seed : int
-        Seed of the words, which are noise.
-    """
+    """Show the acoustic maps of four sensors that emit no calls, in a view without a browser."""
     sensors = [f"sensor-{number + 1}" for number in range(_N_SENSORS)]
     options, given, boss = create_keys(folder, sensors)
     words = some_words(SETTINGS, folder / "words.npy", seed=seed)

@@ -81,13 +81,6 @@ def _measurements(path: Path, found: Archived) -> Iterator[tuple[str, Measuremen
 def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> dict[str, int]:
     """Return the differences between sent and stored measurements.
 
-    Parameters
-    ----------
-    sent : Sent
-    archived : Archived
-    promised : set of DiaryKey
-        Measurements that must be stored, such as all acknowledged ones.
-
     Returns
     -------
     dict of str to int
@@ -123,18 +116,7 @@ def tracebacks(folder: Path) -> int:
 
 
 def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path] | None = None) -> dict[str, Any]:
-    """Compare the sent measurements with the stored ones.
-
-    Parameters
-    ----------
-    folder, archive : Path
-        Folders of the trial and of the recordings.
-    diaries : list of Path
-        Diaries of all senders.
-    kept : list of Path, optional
-        Diaries of senders whose kept measurements must all be stored; all diaries by default. From other senders, only
-        acknowledged measurements must be stored.
-    """
+    """Compare the sent measurements with the stored ones."""
     sent = read_diaries(diaries)
     surely: Sent = sent if kept is None else read_diaries(kept)
     promised = surely.kept | sent.acked()

@@ -39,19 +39,7 @@ def run(
     only: Sequence[str] = (),
     folder: Path | None = None,
 ) -> dict[str, Any]:
-    """Run all measurements, or only some of `PARTS`, and return the report.
-
-    Parameters
-    ----------
-    say : callable
-        Called with a line of progress.
-    duration_s : float, optional
-        Duration of each part. By default, storage takes five minutes and each other part one minute.
-    seed : int
-    only : sequence of str
-    folder : Path, optional
-        Folder for the stored measurements, which need 220 MB per second. By default, the system's temporary folder.
-    """
+    """Run all measurements, or only some of `PARTS`, and return the report."""
     rows = []
     for name, (about, part) in PARTS.items():
         if only and name not in only:

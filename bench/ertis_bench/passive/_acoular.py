@@ -30,15 +30,7 @@ _CLASSES: Final = {
 
 
 class AcousticMapper:
-    """Powers from each direction by Acoular.
-
-    Parameters
-    ----------
-    settings : Settings
-        Signals in float32 with all microphones enabled, and a focus.
-    n_block : int
-        Samples of a block, a power of 2 from 128 on.
-    """
+    """Powers from each direction by Acoular."""
 
     def __init__(self, settings: Settings, n_block: int) -> None:
         import acoular  # noqa: PLC0415 - an optional dependency

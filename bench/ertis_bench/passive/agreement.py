@@ -23,15 +23,7 @@ _CLEAN_STEP: Final = 12  # bins, since Acoular's CLEAN-SC takes longest
 
 
 class Case(NamedTuple):
-    """Method with its settings.
-
-    Attributes
-    ----------
-    passive : dict
-        Fields of `Passive`.
-    limit_db : float
-        Largest difference that is accepted.
-    """
+    """Method with its settings."""
 
     passive: dict[str, Any]
     limit_db: float = 0.1
@@ -49,20 +41,7 @@ CASES: Final[dict[str, Case]] = {
 
 
 def compare(*, seed: int, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Return the differences of each case.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the signals.
-    say : callable
-        Function that reports progress.
-
-    Raises
-    ------
-    DataError
-        A difference exceeds the limit of its case.
-    """
+    """Return the differences of each case."""
     rows = []
     for name, case in CASES.items():
         say(f"comparing {name}")

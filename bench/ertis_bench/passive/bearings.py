@@ -33,15 +33,6 @@ _NEAR_DEG: Final = 2.0
 def measure(seeds: int, seed: int, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Return errors of bearings relative to the bound, and the share of leaks found.
 
-    Parameters
-    ----------
-    seeds : int
-        Number of random trials of each row.
-    seed : int
-        Seed of the first trial.
-    say : callable
-        Receives a line of progress.
-
     Returns
     -------
     dict

@@ -40,16 +40,7 @@ CONFIDENCE: Final = 0.95
 
 
 class NoiseCase(NamedTuple):
-    """Noise, and the maps that are searched.
-
-    Attributes
-    ----------
-    name : str
-    diffuse : float
-        Share of diffuse sound in the power of the noise; the rest is white noise of each microphone.
-    averages : int
-        Measurements in a map.
-    """
+    """Noise, and the maps that are searched."""
 
     name: str
     diffuse: float
@@ -70,15 +61,6 @@ _CHUNK: Final = 50  # Trials of a worker process in one piece.
 
 def measure(*, trials: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Count the maps of noise without sources that yield a bearing.
-
-    Parameters
-    ----------
-    trials : int
-        Maps of each case.
-    seed : int
-        Seed of the noise.
-    say : callable
-        Function that reports progress.
 
     Returns
     -------
@@ -124,15 +106,7 @@ def alarms(case: NoiseCase, seed: int, first: int, count: int) -> list[int]:
 
 
 def measurements(settings: Settings, case: NoiseCase, *, seed: tuple[int, ...]) -> Iterator[Measurement]:
-    """Yield the measurements of a map: parts of one record of noise with the requested coherence.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings of float32 signals.
-    case : NoiseCase
-    seed : tuple of int
-    """
+    """Yield the measurements of a map: parts of one record of noise with the requested coherence."""
     recording = settings.recording
     n_samples, n_mics = recording.n_samples * case.averages, len(microphones(settings.array).enabled_positions_m)
     n_strip = _STRIP * case.averages

@@ -14,15 +14,7 @@ __all__ = ["AVERAGES", "BAND_HZ", "PAIRS", "SNR_DB", "SourcePair", "are_separate
 
 
 class SourcePair(NamedTuple):
-    """Two sources.
-
-    Attributes
-    ----------
-    apart_deg : float
-        Angle between them.
-    weaker_db : float
-        How far the level of the first one lies below that of the second.
-    """
+    """Two sources."""
 
     apart_deg: float
     weaker_db: float = 0.0
@@ -62,17 +54,7 @@ _RMS: Final = 0.05
 
 
 def measure(*, count: int, seed: int, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Return the share of seeds in which each method separates two sources.
-
-    Parameters
-    ----------
-    count : int
-        Number of seeds.
-    seed : int
-        First seed.
-    say : callable
-        Function that reports progress.
-    """
+    """Return the share of seeds in which each method separates two sources."""
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
         cameras = {name: stack.enter_context(_camera(changes)) for name, changes in _METHODS.items()}

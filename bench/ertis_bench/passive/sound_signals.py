@@ -21,14 +21,7 @@ _FOCUS_M: Final = 2.0
 
 
 class NoiseSource(NamedTuple):
-    """Source of white noise at the distance on which maps focus.
-
-    Attributes
-    ----------
-    azimuth_deg, elevation_deg : float
-    rms : float
-        RMS value at each microphone, over all frequencies up to 112.5 kHz.
-    """
+    """Source of white noise at the distance on which maps focus."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -55,17 +48,7 @@ def listening(**changes: Any) -> Settings:
 
 
 def noise(settings: Settings, sources: Sequence[NoiseSource], *, own_rms: float, seed: int) -> Measurement:
-    """Return the sound of incoherent sources, with white noise of each microphone itself.
-
-    Parameters
-    ----------
-    settings : Settings
-        Of `listening`.
-    sources : sequence of NoiseSource
-    own_rms : float
-        RMS value of the noise of a microphone.
-    seed : int
-    """
+    """Return the sound of incoherent sources, with white noise of each microphone itself."""
     random, n_samples = np.random.default_rng(seed), settings.recording.n_samples
     places_m = microphones(settings.array).enabled_positions_m
     frequency_hz = np.fft.rfftfreq(n_samples, 1 / settings.recording.sample_rate_hz)

@@ -28,30 +28,7 @@ def run(
     only: Sequence[str] = (),
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Compare acoustic maps with those of Acoular, time both, and measure their errors.
-
-    Parameters
-    ----------
-    count : int
-        Maps of each method by Acoular.
-    seeds : int
-        Pairs of sources that shall be separated, for each angle; 0 leaves them out.
-    bearings : int
-        Trials of each error of bearings; 0 leaves them out.
-    trials : int
-        Maps of each kind of noise in which false alarms are counted; 0 leaves them out.
-    seed : int
-        Seed of the signals, and of the first trial.
-    only : sequence of str
-        Names of ``PARTS`` to measure; all by default.
-    say : callable
-        Function that reports progress.
-
-    Raises
-    ------
-    DataError
-        A map differs from that of Acoular.
-    """
+    """Compare acoustic maps with those of Acoular, time both, and measure their errors."""
     described: dict[str, Any] = {
         "machine": machine.describe(),
         "seed": seed,

@@ -25,14 +25,7 @@ _SLOW_STEP: Final = 23  # bins of Acoular's CLEAN-SC
 
 
 class Taken(NamedTuple):
-    """Time of a call.
-
-    Attributes
-    ----------
-    wall_ms : float
-    processor_ms : float
-        Sum over all cores.
-    """
+    """Time of a call."""
 
     wall_ms: float
     processor_ms: float
@@ -51,18 +44,7 @@ class Taken(NamedTuple):
 
 
 def measure(*, count: int, seed: int, with_acoular: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Time maps of each method from float32 signals to third octaves, in turns with Acoular.
-
-    Parameters
-    ----------
-    count : int
-        Maps by Acoular; this package computes several for each.
-    seed : int
-        Seed of the signals.
-    with_acoular : bool
-    say : callable
-        Function that reports progress.
-    """
+    """Time maps of each method from float32 signals to third octaves, in turns with Acoular."""
     rows = []
     for name, case in TIMED.items():
         say(f"timing {name}")
@@ -107,15 +89,7 @@ class _Theirs:
 
 
 def times_of_parts(*, count: int, seed: int) -> dict[str, dict[str, float]]:
-    """Return the times of the parts of a map of delay-and-sum.
-
-    Parameters
-    ----------
-    count : int
-        Repetitions.
-    seed : int
-        Seed of the signals.
-    """
+    """Return the times of the parts of a map of delay-and-sum."""
     settings = listening(processing__directions=DIRECTIONS)
     heard = noise(settings, SOURCES, own_rms=OWN_RMS, seed=seed)
     with AcousticCamera(settings, "cpu", check=False) as camera:

@@ -29,19 +29,7 @@ PAPER: Final = "SciPy, the paper's algorithm"
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Implementation to compare.
-
-    Attributes
-    ----------
-    package : str
-        Imported package, whose distribution has the same name.
-    make : callable
-        Returns the implementation for settings.
-    max_error_db : float
-        Largest error of a correct image.
-    is_slow : bool
-        True to measure it a tenth as often.
-    """
+    """Implementation to compare."""
 
     package: str
     make: Callable[[Settings], Implementation]
@@ -65,20 +53,7 @@ PEERS: dict[str, Peer] = {
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure all installed implementations, and return a report with machine, rows and conditions.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per implementation and number of directions; a tenth of it for slow ones.
-    say : callable
-        Called with a line of progress.
-
-    Raises
-    ------
-    DataError
-        An image is wrong and therefore not timed.
-    """
+    """Measure all installed implementations, and return a report with machine, rows and conditions."""
     measurement, source = input_measurements.measurement()
     installed = {name: peer for name, peer in PEERS.items() if importlib.util.find_spec(peer.package) is not None}
     rows: list[dict[str, Any]] = []

@@ -21,15 +21,7 @@ _STATED_EVERY: Final = 4  # One of so many platforms also serves for emitters th
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Fuse platforms whose emitters all work, and with a broken one, as stated and as the other kind.
-
-    Parameters
-    ----------
-    count, seed : int
-        Number of platforms for each kind of emitter, and seed of the first one.
-    say : callable
-        Function that reports progress.
-    """
+    """Fuse platforms whose emitters all work, and with a broken one, as stated and as the other kind."""
     rows: dict[tuple[float, int], Counter[str]] = {}
     for diameter_m, other_m in zip(EMITTERS_M, EMITTERS_M[::-1], strict=True):
         for number in range(seed, seed + count):

@@ -48,15 +48,7 @@ class PlatformTrial(NamedTuple):
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Check platforms with right clocks, with a wrong clock, and with a wrong mounting.
-
-    Parameters
-    ----------
-    count, seed : int
-        Number of platforms for each kind of emitter, and seed of the first one.
-    say : callable
-        Function that reports progress.
-    """
+    """Check platforms with right clocks, with a wrong clock, and with a wrong mounting."""
     rows = []
     for diameter_m in EMITTERS_M:
         heard, accused, found_clocks, found_mountings, errors_us = 0, 0, 0, 0, []

@@ -32,15 +32,7 @@ _SPURIOUS_M: Final = 0.15
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return errors of points with equal calls, with different ones, and with an image for each pair of these.
-
-    Parameters
-    ----------
-    count, seed : int
-        Number of scenes for each kind of emitter, and seed of the first one.
-    say : callable
-        Function that reports progress.
-    """
+    """Return errors of points with equal calls, with different ones, and with an image for each pair of these."""
     found = []
     for diameter_m in EMITTERS_M:
         for calls in ("equal", "different", "different, an image for each pair"):

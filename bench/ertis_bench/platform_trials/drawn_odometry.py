@@ -71,19 +71,7 @@ def _twist(before: Floats, after: Floats, time_s: float) -> Floats:
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None], kinds: Sequence[str] = tuple(KINDS)) -> dict[str, Any]:
-    """Run odometry in random scenes of all kinds.
-
-    Parameters
-    ----------
-    count : int
-        Scenes of each kind.
-    seed : int
-        Seed of the first scene.
-    say : callable
-        Function that reports progress.
-    kinds : sequence of str
-        Kinds of scenes.
-    """
+    """Run odometry in random scenes of all kinds."""
     imager, rows = DrawnImager(), []
     for kind in kinds:
         trials = []

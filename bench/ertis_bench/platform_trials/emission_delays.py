@@ -15,15 +15,7 @@ _DELAYS_MS: Final = 0.0, 1.0, 2.0, 3.0, 4.0  # With longer delays, a record does
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the reflectors that points locate, and the points without a reflector, by delay.
-
-    Parameters
-    ----------
-    count, seed : int
-        Number of scenes for each delay and kind of emitter, and seed of the first one.
-    say : callable
-        Function that reports progress.
-    """
+    """Return the reflectors that points locate, and the points without a reflector, by delay."""
     rows = []
     for diameter_m in EMITTERS_M:
         for delay_ms in _DELAYS_MS:

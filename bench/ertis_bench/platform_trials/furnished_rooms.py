@@ -64,15 +64,7 @@ _PLAN: Final = EffectPlan(
 
 
 class Motion(NamedTuple):
-    """Pose and motion of a platform at one instant, in the plane.
-
-    Attributes
-    ----------
-    x_m, y_m, yaw_rad : float
-        Pose in the world.
-    forward_m_s, left_m_s, yaw_rate_rad_s : float
-        Velocity in the frame of the platform.
-    """
+    """Pose and motion of a platform at one instant, in the plane."""
 
     x_m: float
     y_m: float
@@ -136,14 +128,7 @@ def _room(seed: int) -> tuple[np.random.Generator, float, float]:
 
 
 def random_space(seed: int, spacing_m: float) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
-    """Return the scatterers and boxes of a furnished room with rough walls, floor and ceiling, around the sensors.
-
-    Parameters
-    ----------
-    seed : int
-    spacing_m : float
-        Mean spacing of scatterers along both axes of a surface.
-    """
+    """Return the scatterers and boxes of a furnished room with rough walls, floor and ceiling, around the sensors."""
     random, half_x_m, half_y_m, half_z_m = _space(seed)
     half_m = half_x_m, half_y_m, half_z_m
     points = []
@@ -222,15 +207,6 @@ def hall(seed: int, wall_spacing_m: float = _WALL_SPACING_M, names: Sequence[str
     """Return a hall of 16 m by 10 m, and a platform that drives round it for 90 m with 1,268 pulses.
 
     Walls are rough: rows of scatterers with random strengths. Posts stand on both sides of the path.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the scatterers.
-    wall_spacing_m : float, default 0.15
-        Mean spacing of the scatterers of a wall.
-    names : sequence of str
-        Sensors on the platform.
     """
     random = np.random.default_rng([seed, 26])
     half_x_m, half_y_m = HALL_M[0] / 2, HALL_M[1] / 2

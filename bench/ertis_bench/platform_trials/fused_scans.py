@@ -34,15 +34,7 @@ _N_RAYS: Final = 9  # of each beam
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the beams of scans that differ from rays, and the posts that scans show, by kind of emitter.
-
-    Parameters
-    ----------
-    count, seed : int
-        Number of scenes for each kind of emitter, and seed of the first one.
-    say : callable
-        Function that reports progress.
-    """
+    """Return the beams of scans that differ from rays, and the posts that scans show, by kind of emitter."""
     rows = []
     for diameter_m in EMITTERS_M:
         fuser, found = Fuser(_SENSORS, emitter_diameter_m=diameter_m), np.zeros(5, np.int64)

@@ -62,24 +62,7 @@ class _Shot(NamedTuple):
 
 
 def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: Sequence[str] = ()) -> dict[str, Any]:
-    """Fuse images of random reflectors, and of rooms with rough walls.
-
-    Parameters
-    ----------
-    count : int
-        Number of scenes with reflectors, for each kind of emitter.
-    rooms : int
-        Number of rooms.
-    seed : int
-        Seed of the first scene.
-    say : callable
-        Function that reports progress.
-    only : sequence of str
-        ``calls`` to compare equal calls with different ones instead, ``clocks`` to check clocks and mountings by
-        direct sound, ``delays`` to compare delays of sensors that emit in sequence, ``emitters`` to find broken and
-        wrongly stated emitters, ``reflections`` to count spurious confirmed points where walls reflect sound several
-        times, or ``scans`` to compare laser scans with rays.
-    """
+    """Fuse images of random reflectors, and of rooms with rough walls."""
     if only:
         report: dict[str, Any] = {}
         for part in only:

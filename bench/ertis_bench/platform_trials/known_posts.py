@@ -50,25 +50,8 @@ class _Echoes(NamedTuple):
 
 
 def silence_ratio(drawn: EmitterRoom, images: list[Energyscape], diameter_m: float, pulse: int, dead: str) -> Floats:
-    """Return the logarithm of how much better the silence of each emitter explains a pulse than emission: (emitter,).
-
-    Parameters
-    ----------
-    drawn : EmitterRoom
-    images : list of Energyscape
-        Those of the pulse.
-    diameter_m : float
-        Diameter of the emitters.
-    pulse : int
-    dead : str
-        Sensor whose call is not emitted, or empty.
-
-    Returns
-    -------
-    numpy.ndarray
-        It counts posts that at least two echoes of other calls show. Echoes count if noise, side lobes and the echoes
-        of other posts hardly reach them.
-    """
+    """Return the logarithm of how much better the silence of each emitter explains a pulse: (emitter,)."""
+    # Posts count if two or more echoes of other calls show them, which noise, side lobes and other posts hardly reach.
     echoes = _echoes(drawn, diameter_m, pulse)
     names = [*drawn.mountings]
     sent = np.where(np.isin(names, [dead])[:, None], 0.0, echoes.amplitude)

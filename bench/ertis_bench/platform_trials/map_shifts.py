@@ -26,15 +26,7 @@ _NEAR_M: Final = 1.5 * _CELL_M + 1e-6
 
 
 def run(*, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Map the example with all poses moved by a part of a cell.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the shifts.
-    say : callable
-        Function that reports progress.
-    """
+    """Map the example with all poses moved by a part of a cell."""
     scene = _example()
     mountings = {each.name: (each.position_m or (), each.quaternion().tolist()) for each in scene.sensors}
     shifts_m = np.random.default_rng(seed).uniform(0, _CELL_M, (_N_SHIFTS, 2))

@@ -182,26 +182,7 @@ def run(
     say: Callable[[str], None],
     only: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Map random rooms and a hall.
-
-    Parameters
-    ----------
-    count : int
-        Number of rooms.
-    poses : int
-        Number of poses in each room.
-    length_m : float
-        Length of the path through the hall; 0 leaves out the hall. Maps of three dimensions have no hall.
-    rate_hz : float
-        Pulses per second.
-    seed : int
-        Seed of the first room, and of the hall.
-    say : callable
-        Function that reports progress.
-    only : sequence of str
-        ``space`` for maps of three dimensions instead, of rooms with rough floors and ceilings, or ``shifts`` for maps
-        of the example platform whose poses are moved by a part of a cell.
-    """
+    """Map random rooms and a hall."""
     if "shifts" in only:
         return map_shifts.run(seed=seed, say=say)
     dimensions = 3 if only else 2

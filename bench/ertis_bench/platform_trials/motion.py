@@ -34,21 +34,7 @@ _TO_SHOWN: Final = np.array([1.0, 1.0, math.degrees(1.0)])
 def run(
     *, count: int, length_m: float, seed: int, say: Callable[[str], None], only: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Estimate velocities in random rooms, and the path through a hall.
-
-    Parameters
-    ----------
-    count : int
-        Number of rooms.
-    length_m : float
-        Length of the path, up to 90 m; 0 leaves out the hall.
-    seed : int
-        Seed of the first room, and of the hall.
-    say : callable
-        Function that reports progress.
-    only : sequence of str
-        ``scenes`` for odometry in drawn scenes instead, ``count`` of each kind.
-    """
+    """Estimate velocities in random rooms, and the path through a hall."""
     if only:
         return drawn_odometry.run(count=count, seed=seed, say=say)
     errors, deviations, seconds = [], [], []

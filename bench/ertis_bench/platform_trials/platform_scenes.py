@@ -19,17 +19,7 @@ _APART_M = 0.4
 
 
 def platform_scene(seed: int, points: tuple[Point, ...], diameter_m: float, level_db: float = -24.0) -> Scene:
-    """Return a scene of four sensors on a platform.
-
-    Parameters
-    ----------
-    seed : int
-    points : tuple of Point
-    diameter_m : float
-        Diameter of the emitters.
-    level_db : float
-        Level of the emitters.
-    """
+    """Return a scene of four sensors on a platform."""
     sensors = tuple(
         Sensor(
             name=name,

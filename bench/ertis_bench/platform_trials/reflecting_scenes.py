@@ -45,19 +45,7 @@ _RANGE_M: Final = 0.3, 4.5
 
 
 class ReflectingScene(NamedTuple):
-    """Platform in random surroundings.
-
-    Attributes
-    ----------
-    seed : int
-    kind : str
-        One of `KINDS`.
-    platform : int
-        Index into `PLATFORMS`.
-    diameter_m : float
-        Diameter of the emitters.
-    room : Room
-    """
+    """Platform in random surroundings."""
 
     seed: int
     kind: str

@@ -118,14 +118,7 @@ def wall(turn_rad: float, away_m: float, level_db: float) -> Face:
 
 
 def random_room(seed: int, kind: str) -> Room:
-    """Return four to eight posts around a platform, with one or two walls, two boxes, or both.
-
-    Parameters
-    ----------
-    seed : int
-    kind : str
-        ``posts``, ``walls``, ``boxes`` or ``both``.
-    """
+    """Return four to eight posts around a platform, with one or two walls, two boxes, or both."""
     random = np.random.default_rng([seed, 42])
     faces: list[Face] = []
     walls: list[tuple[float, float]] = []

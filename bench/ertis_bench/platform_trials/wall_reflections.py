@@ -25,15 +25,7 @@ _IMAGES: Final = "all", "one missing"
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Fuse all images of scenes with walls and posts, and those without the image of each sensor in turn.
-
-    Parameters
-    ----------
-    count, seed : int
-        Number of scenes of each kind, and seed of the first one.
-    say : callable
-        Function that reports progress.
-    """
+    """Fuse all images of scenes with walls and posts, and those without the image of each sensor in turn."""
     scenes = [ReflectingScene.drawn(number, kind) for number in range(seed, seed + count) for kind in KINDS]
     counts: dict[str, Counter[str]] = {each: Counter() for each in _IMAGES}
     errors: dict[str, list[Floats]] = {each: [np.empty((0, 2, 2))] for each in _IMAGES}
@@ -63,12 +55,6 @@ def _pulses(images: dict[str, Energyscape]) -> Iterator[tuple[str, list[Energysc
 
 def compared(points: PointCloud, scene: ReflectingScene) -> tuple[dict[str, int], Floats]:
     """Compare confirmed points with posts and walls.
-
-    Parameters
-    ----------
-    points : PointCloud
-        Fused points of a pulse.
-    scene : ReflectingScene
 
     Returns
     -------

@@ -71,20 +71,7 @@ def free_field() -> Scene:
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure the time of measurements of `free_field`, including modulators.
-
-    Parameters
-    ----------
-    count : int
-        Measurements per set of effects.
-    say : callable
-        Called with a line of progress.
-
-    Raises
-    ------
-    DataError
-        The two images differ by more than the tolerance of the omitted effects.
-    """
+    """Measure the time of measurements of `free_field`, including modulators."""
     scene = free_field()
     say("choosing the effects")
     # Keys of the scene request most of these effects, which would keep them on. Here, only the change of the image

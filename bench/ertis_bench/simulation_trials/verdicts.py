@@ -37,23 +37,7 @@ _PLAN = Accuracy(
 
 
 def run(*, count: int, say: Callable[[str], None], first: int = 0) -> dict[str, Any]:
-    """Check the verdicts on some random scenes.
-
-    Parameters
-    ----------
-    count : int
-        Number of scenes.
-    say : callable
-        Called with a line of progress.
-    first : int
-        Seed of the first scene.
-
-    Returns
-    -------
-    dict
-        Numbers of scenes, verdicts and A/B renders, and the omitted effects that change an image by more than the
-        tolerance.
-    """
+    """Check the verdicts on some random scenes."""
     tried, rendered, wrong = 0, 0, []
     for seed in range(first, first + count):
         say(f"scene {seed}")
@@ -75,14 +59,7 @@ def with_one(plan: EffectPlan, name: str, *, on: bool) -> EffectPlan:
 
 
 class Trial:
-    """Comparison of images of one measurement of a scene with different effects.
-
-    Parameters
-    ----------
-    scene : Scene
-    index : int
-        Index of the measurement.
-    """
+    """Comparison of images of one measurement of a scene with different effects."""
 
     def __init__(self, scene: Scene, index: int = 0) -> None:
         self.scene, self.index = scene, index

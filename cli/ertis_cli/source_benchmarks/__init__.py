@@ -19,32 +19,37 @@ def _benchmark(name: str) -> ModuleType:
     return importlib.import_module(f"ertis_bench.{name}")
 
 
+def _number(name: str, default: int, about: str, *, least: int = 1, metavar: str = "N") -> Callable[..., Any]:
+    """Return the option of a whole number."""
+    return click.option(
+        name, type=click.IntRange(min=least), default=default, show_default=True, metavar=metavar, help=about
+    )
+
+
 def _seed(about: str, *, default: int = 0) -> Callable[..., Any]:
     """Return a seed option with a fixed default, so that runs are reproducible."""
-    return click.option(
-        "--seed", type=click.IntRange(min=0), default=default, show_default=True, metavar="S", help=about
-    )
+    return _number("--seed", default, about, least=0, metavar="S")
+
+
+def _quantity(name: str, variable: str, limits: click.FloatRange, default: float, metavar: str, about: str) -> Any:
+    """Return the option of a number with a unit."""
+    return click.option(name, variable, type=limits, default=default, show_default=True, metavar=metavar, help=about)
 
 
 def _random_settings(default: int) -> Callable[..., Any]:
     """Return the options of a benchmark over random settings."""
-    count = click.option(
-        "--count",
-        type=click.IntRange(min=1),
-        default=default,
-        show_default=True,
-        metavar="N",
-        help="Number of random settings.",
-    )
-    seed = _seed("Seed of the first setting.")
+    count, seed = _number("--count", default, "Number of random settings."), _seed("Seed of the first setting.")
     return lambda command: count(seed(command))
+
+
+def _report(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of all benchmarks that report a table."""
+    return update(options.quiet(options.as_json(command)))
 
 
 @bench.command()
 @count_of(20)
-@update
-@options.quiet
-@options.as_json
+@_report
 def peers(**given: Any) -> None:
     """Compare with NumPy, Acoular, PyTorch and JAX.
 
@@ -54,7 +59,7 @@ def peers(**given: Any) -> None:
 
 
 @bench.command()
-@click.option("--count", type=click.IntRange(min=1), default=5, show_default=True, metavar="N", help="Repetitions.")
+@_number("--count", 5, "Repetitions.")
 @click.option(
     "--update",
     "targets",
@@ -105,9 +110,7 @@ def costs(*, count: int, targets: tuple[Path, ...], units: tuple[str, ...], quie
 
 @bench.command()
 @_random_settings(200)
-@update
-@options.quiet
-@options.as_json
+@_report
 def verification(**given: Any) -> None:
     """Compare --verify with a float64 reference.
 
@@ -121,9 +124,7 @@ def verification(**given: Any) -> None:
 @click.option(
     "--directions", metavar="GRID", default="3000", show_default=True, help="Directions, as in 'ertis process'."
 )
-@update
-@options.quiet
-@options.as_json
+@_report
 def beamformers(**given: Any) -> None:
     """Measure time and error of each beamformer.
 
@@ -134,9 +135,7 @@ def beamformers(**given: Any) -> None:
 
 @bench.command()
 @_random_settings(300)
-@update
-@options.quiet
-@options.as_json
+@_report
 def budgets(**given: Any) -> None:
     """Count random settings that exceed their error budget.
 
@@ -146,13 +145,9 @@ def budgets(**given: Any) -> None:
 
 
 @bench.command()
-@click.option(
-    "--count", type=click.IntRange(min=1), default=400, show_default=True, metavar="N", help="Points per case."
-)
+@_number("--count", 400, "Points per case.")
 @_seed("Seed of the point positions.")
-@update
-@options.quiet
-@options.as_json
+@_report
 def points(**given: Any) -> None:
     """Compare errors of points with their uncertainties.
 
@@ -162,24 +157,18 @@ def points(**given: Any) -> None:
 
 
 @bench.command()
-@click.option(
-    "--count", type=click.IntRange(min=1), default=30, show_default=True, metavar="N", help="Arrays with faults."
-)
-@click.option(
-    "--healthy", type=click.IntRange(min=0), default=200, show_default=True, metavar="N", help="Arrays without faults."
-)
+@_number("--count", 30, "Arrays with faults.")
+@_number("--healthy", 200, "Arrays without faults.", least=0)
 @_seed("Seed of the first array.")
-@update
-@options.quiet
-@options.as_json
+@_report
 def calibration(**given: Any) -> None:
     """Calibrate arrays with random errors, and count the faults found."""
     run("calibration", _benchmark("error_trials.calibration"), **given)
 
 
 @bench.command()
-@click.option("--count", type=click.IntRange(min=1), default=12, show_default=True, metavar="N", help="Scenes.")
-@click.option("--rooms", type=click.IntRange(min=0), default=4, show_default=True, metavar="N", help="Rooms.")
+@_number("--count", 12, "Scenes.")
+@_number("--rooms", 4, "Rooms.", least=0)
 @_seed("Seed of the first scene.")
 @click.option(
     "--only",
@@ -191,23 +180,14 @@ def calibration(**given: Any) -> None:
     "wrongly stated emitters, reflections counts spurious confirmed points where walls reflect sound several times, "
     "and scans compares laser scans of confirmed reflectors with rays.",
 )
-@update
-@options.quiet
-@options.as_json
+@_report
 def fusion(**given: Any) -> None:
     """Measure ghosts and positions in fused images of four sensors."""
     run("fusion", _benchmark("platform_trials.fusion"), **given)
 
 
 @bench.command()
-@click.option(
-    "--count",
-    type=click.IntRange(min=1),
-    default=20,
-    show_default=True,
-    metavar="N",
-    help="Rooms, or scenes of each kind.",
-)
+@_number("--count", 20, "Rooms, or scenes of each kind.")
 @click.option(
     "--only",
     multiple=True,
@@ -215,47 +195,33 @@ def fusion(**given: Any) -> None:
     help="Run odometry in drawn scenes instead: moving objects, few reflectors, corridors, platforms at rest, and "
     "others.",
 )
-@click.option(
+@_quantity(
     "--length",
     "length_m",
-    type=click.FloatRange(min=0.0),
-    default=0.0,
-    show_default=True,
-    metavar="M",
-    help="Length of a path through a hall; 0 leaves out the hall.",
+    click.FloatRange(min=0.0),
+    0.0,
+    "M",
+    "Length of a path through a hall; 0 leaves out the hall.",
 )
 @_seed("Seed of the first room or scene.")
-@update
-@options.quiet
-@options.as_json
+@_report
 def motion(**given: Any) -> None:
     """Measure errors of ego-velocity and odometry."""
     run("motion", _benchmark("platform_trials.motion"), **given)
 
 
 @bench.command("map")
-@click.option("--count", type=click.IntRange(min=0), default=1, show_default=True, metavar="N", help="Rooms.")
-@click.option(
-    "--poses", type=click.IntRange(min=1), default=40, show_default=True, metavar="N", help="Poses in each room."
-)
-@click.option(
+@_number("--count", 1, "Rooms.", least=0)
+@_number("--poses", 40, "Poses in each room.")
+@_quantity(
     "--length",
     "length_m",
-    type=click.FloatRange(0.0, 500.0),
-    default=32.0,
-    show_default=True,
-    metavar="M",
-    help="Length of the path through a hall; 0 leaves out the hall.",
+    click.FloatRange(0.0, 500.0),
+    32.0,
+    "M",
+    "Length of the path through a hall; 0 leaves out the hall.",
 )
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=click.FloatRange(0.0, 20.0, min_open=True),
-    default=2.5,
-    show_default=True,
-    metavar="HZ",
-    help="Pulses per second, at 1 m/s.",
-)
+@_quantity("--rate", "rate_hz", click.FloatRange(0.0, 20.0, min_open=True), 2.5, "HZ", "Pulses per second, at 1 m/s.")
 @click.option(
     "--only",
     multiple=True,
@@ -265,32 +231,17 @@ def motion(**given: Any) -> None:
     "and shifts maps the example platform with poses that are moved by a part of a cell.",
 )
 @_seed("Seed of the first room, and of the hall.", default=1)
-@update
-@options.quiet
-@options.as_json
+@_report
 def mapping(**given: Any) -> None:
     """Measure errors of occupancy maps."""
     run("map", _benchmark("platform_trials.mapping"), **given)
 
 
 @bench.command()
-@click.option(
-    "--count", type=click.IntRange(min=1), default=3, show_default=True, metavar="N", help="Maps of each by Acoular."
-)
-@click.option(
-    "--seeds", type=click.IntRange(min=0), default=100, show_default=True, metavar="N", help="Pairs of sources."
-)
-@click.option(
-    "--bearings", type=click.IntRange(min=0), default=20, show_default=True, metavar="N", help="Trials of bearings."
-)
-@click.option(
-    "--trials",
-    type=click.IntRange(min=1),
-    default=1000,
-    show_default=True,
-    metavar="N",
-    help="Maps of each kind of noise in which false alarms are counted.",
-)
+@_number("--count", 3, "Maps of each by Acoular.")
+@_number("--seeds", 100, "Pairs of sources.", least=0)
+@_number("--bearings", 20, "Trials of bearings.", least=0)
+@_number("--trials", 1000, "Maps of each kind of noise in which false alarms are counted.")
 @click.option(
     "--only",
     multiple=True,
@@ -298,9 +249,7 @@ def mapping(**given: Any) -> None:
     help="Count only false alarms of bearings, which takes a few minutes.",
 )
 @_seed("Seed of the signals, and of the first trial.")
-@update
-@options.quiet
-@options.as_json
+@_report
 def passive(**given: Any) -> None:
     """Measure errors and times of acoustic maps.
 
@@ -311,9 +260,7 @@ def passive(**given: Any) -> None:
 
 @bench.command()
 @count_of(30)
-@update
-@options.quiet
-@options.as_json
+@_report
 def scaling(**given: Any) -> None:
     """Measure time versus directions, ranges and threads.
 
@@ -330,9 +277,7 @@ def scaling(**given: Any) -> None:
     metavar="N",
     help="Instead of timing, restore each effect that was left out of N random scenes; fail if it changes an image.",
 )
-@update
-@options.quiet
-@options.as_json
+@_report
 def simulation(*, verdicts: int | None, **given: Any) -> None:
     """Time simulations with relevant and with all effects."""
     if verdicts is None:
@@ -356,20 +301,9 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
 
 
 @bench.command()
-@click.option(
-    "--count", type=click.IntRange(min=2), default=24, show_default=True, metavar="N", help="Number of recordings."
-)
-@click.option(
-    "--rounds",
-    type=click.IntRange(min=1),
-    default=5,
-    show_default=True,
-    metavar="N",
-    help="Number of times to measure each case; all cases take turns.",
-)
-@update
-@options.quiet
-@options.as_json
+@_number("--count", 24, "Number of recordings.", least=2)
+@_number("--rounds", 5, "Number of times to measure each case; all cases take turns.")
+@_report
 def many(**given: Any) -> None:
     """Time many recordings on workers and a dask cluster.
 
@@ -383,9 +317,7 @@ def many(**given: Any) -> None:
     "--long", is_flag=True, help="Use 1,000 healthy arrays and 30 trials per fault instead of 40 arrays and 1 trial."
 )
 @_seed("Seed of the scenes.")
-@update
-@options.quiet
-@options.as_json
+@_report
 def of_health(**given: Any) -> None:
     """Count false alarms and named faults of health checks."""
     run("health", _benchmark("health_trials"), **given)
@@ -409,9 +341,7 @@ def of_health(**given: Any) -> None:
     metavar="DIR",
     help="Folder for stored data; needs 220 MB per second of the run.",
 )
-@update
-@options.quiet
-@options.as_json
+@_report
 def network(*, only: tuple[str, ...], **given: Any) -> None:
     """Measure storage and imaging of a central node.
 
@@ -428,19 +358,16 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
 
 @bench.command()
-@click.option(
+@_quantity(
     "--duration",
     "duration_s",
-    type=click.FloatRange(min=2.0),
-    default=30.0,
-    show_default=True,
-    metavar="S",
-    help="Duration of each run: images, images and storage, serial line.",
+    click.FloatRange(min=2.0),
+    30.0,
+    "S",
+    "Duration of each run: images, images and storage, serial line.",
 )
 @_seed("Seed of the samples.", default=1)
-@update
-@options.quiet
-@options.as_json
+@_report
 def latency(**given: Any) -> None:
     """Time each stage from a sensor node to an application.
 
@@ -461,9 +388,7 @@ def latency(**given: Any) -> None:
 @click.option(
     "--newest", is_flag=True, help="Measure nothing; write the tables of the newest results. No GPU is needed."
 )
-@update
-@options.quiet
-@options.as_json
+@_report
 def gpu(*, newest: bool, **given: Any) -> None:
     """Test and time the NVIDIA GPU of this machine.
 
