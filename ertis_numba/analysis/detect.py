@@ -261,7 +261,9 @@ def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:
     across_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1])
     range_m = (across_m if is_planar else cloud.range_m).tolist()
     elevation_deg = [0.0] * len(cloud) if is_planar else cloud.elevation_deg.tolist()
-    rows = zip(cloud.azimuth_deg.tolist(), elevation_deg, range_m, level_dbfs.tolist(), strict=True)
+    unknown_m = np.full((len(cloud), 2), np.nan)
+    sd_m = (unknown_m if cloud.uncertainty_m is None else cloud.uncertainty_m.astype(np.float64)).tolist()
+    rows = zip(cloud.azimuth_deg.tolist(), elevation_deg, range_m, level_dbfs.tolist(), sd_m, strict=True)
     return [
         Peak(
             azimuth_deg=azimuth_deg,
@@ -270,8 +272,10 @@ def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:
             level_db=level - level_dbfs[0],
             level_dbfs=level,
             grid_error_deg=0.0,
+            angle_sd_deg=math.degrees(across_sd_m / away_m) if away_m else math.inf,
+            range_sd_m=range_sd_m,
         )
-        for azimuth_deg, up_deg, away_m, level in rows
+        for azimuth_deg, up_deg, away_m, level, (range_sd_m, across_sd_m) in rows
     ]
 
 

@@ -587,9 +587,12 @@ def test_peaks_plots_and_exports_of_fused_files_show_the_points_of_the_fusion(fu
     path = fused_file
     code, output = run("peaks", path, "--json", "--top", "100", "--min-level", "-20")
     assert code == 0
-    listed = [(each["range_m"], each["azimuth_deg"]) for each in json.loads(output.splitlines()[-1])["peaks"]]
+    rows = json.loads(output.splitlines()[-1])["peaks"]
+    listed = [(row["range_m"], row["azimuth_deg"]) for row in rows]
     wanted = zip(np.hypot(*located.position_m[:, :2].T), np.degrees(located.azimuth_rad), strict=True)
     np.testing.assert_allclose(listed, [*wanted], atol=1e-3)
+    sd_m = [(row["range_sd_m"], row["range_m"] * np.radians(row["angle_sd_deg"])) for row in rows]
+    np.testing.assert_allclose(sd_m, located.uncertainty_m, rtol=1e-2)
     assert run("export", path, "-o", tmp_path / "points.csv", "-q")[0] == 0
     with (tmp_path / "points.csv").open() as file:
         exported = [[float(row[f"{axis}_m"]) for axis in "xyz"] for row in csv.DictReader(file)]
