@@ -54,13 +54,15 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
     import numpy as np
 
     fused = arrival.fused
-    range_m = np.linalg.norm(fused.points.position_m, axis=1)
+    points = fused.points.only(np.flatnonzero(fused.points.is_certain))
+    range_m = np.linalg.norm(points.position_m, axis=1)
     nearest = int(np.argmin(range_m)) if len(range_m) else None
     age_ms = None if arrival.age_s is None else round(1e3 * arrival.age_s, 3)
     is_checked = fused.stamp.sync_count % _CHECKED_EVERY == 0
     without_own = list(fused.without_own_echo) if is_checked else None
     if as_json:
-        position_m = None if nearest is None else [round(each, 4) for each in fused.points.position_m[nearest].tolist()]
+        known = () if nearest is None or points.uncertainty_m is None else points.uncertainty_m[nearest].tolist()
+        position_m = None if nearest is None else [round(each, 4) for each in points.position_m[nearest].tolist()]
         options.print_json(
             {
                 "event": "fused",
@@ -69,6 +71,7 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
                 "age_ms": age_ms,
                 "n_points": len(range_m),
                 "nearest_m": position_m,
+                "nearest_sd_m": [round(each, 5) for each in known] or None,
                 "sensors": list(fused.sensors),
                 "missing": list(fused.missing),
                 "unheard": list(fused.unheard),
@@ -79,7 +82,7 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
         return
     place = "no echo above noise" if fused.is_empty else "no reflector"
     if nearest is not None:
-        x, y, _ = fused.points.position_m[nearest].tolist()
+        x, y, _ = points.position_m[nearest].tolist()
         place = f"{range_m[nearest]:.3f} m at {math.degrees(math.atan2(y, x)):+.1f}°"
     absent = f", without {' '.join(fused.missing)}" if fused.missing else ""
     absent += f", {' '.join(fused.unheard)} not heard" if fused.unheard else ""

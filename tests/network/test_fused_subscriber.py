@@ -246,6 +246,7 @@ def test_listen_prints_fused_pulses(tmp_path):
     assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert fused["sensors"] == ["front", "back"]
     assert fused["nearest_m"][0] == pytest.approx(-1.14, abs=0.02)
+    assert all(0 < sd_m < 0.05 for sd_m in fused["nearest_sd_m"])
     assert (summary["received"], summary["dropped"]) == (1, 0)
 
 
