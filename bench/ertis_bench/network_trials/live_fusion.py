@@ -33,7 +33,7 @@ _DIRECTIONS: Final = "90"
 Found = dict[str, Any]
 
 
-def measure(folder: Path, duration_s: float, seed: int) -> Found:
+def measure(folder: Path, duration_s: float, seed: int, rate_hz: float = _RATE_HZ) -> Found:
     """Fuse the images of four sensors in an application that starts while the central node serves.
 
     Its pipelines exist before; the kernels and tables of the fusion do not.
@@ -43,7 +43,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
     sensors = [each.name for each in scene.sensors]
     options, given, boss = create_keys(folder, sensors)
     words, expected = _rendered(scene, folder)
-    count = round(duration_s * _RATE_HZ)
+    count = round(duration_s * rate_hz)
     diaries = folder / "warm.ndjson", folder / "sender.ndjson", folder / "fused.ndjson"
     with ExitStack() as stack:
         serve = stack.enter_context(Serve.running(folder, "--directions", _DIRECTIONS, *options, keys=boss))
@@ -51,7 +51,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
             address=serve.listen,
             diary=str(diaries[0]),
             sensors=tuple(sensors),
-            rate_hz=_RATE_HZ,
+            rate_hz=rate_hz,
             count=_WARM_UP,
             words=str(words),
             small=False,
@@ -85,7 +85,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         "part": "fused image",
         "directions": _DIRECTIONS,
         "sensors": len(sensors),
-        "rate_hz": _RATE_HZ,
+        "rate_hz": rate_hz,
         "goal": GOAL,
         "pulses": count,
         "published": after[0] - before[0],

@@ -358,6 +358,18 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
 
 @bench.command()
+@_quantity("--duration", "duration_s", click.FloatRange(min=10.0), 60.0, "S", "Time that each number must last.")
+@_seed("Seed of the samples.", default=1)
+@_report
+def capacity(**given: Any) -> None:
+    """Find how many sensors this machine stores, images and fuses without a loss.
+
+    Takes about ten minutes. Stop other programs first.
+    """
+    run("capacity", _benchmark("network_trials.capacity"), **given)
+
+
+@bench.command()
 @_quantity(
     "--duration",
     "duration_s",
