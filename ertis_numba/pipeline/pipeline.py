@@ -252,7 +252,9 @@ class Pipeline:
             return WordStream()
         return self._chain.stream(np.zeros(self._accepted_words.format.shape_2d, self._accepted_words.format.dtype))
 
-    def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
+    def process_batch(
+        self, measurements: Iterable[Measurement], out: NDArray[np.float32] | None = None
+    ) -> list[Energyscape]:
         """Return the energyscapes of several measurements, in their order, with the same bits as from `process`.
 
         A GPU overlaps transfers and computation of consecutive measurements. On a processor, each core processes a
@@ -262,6 +264,9 @@ class Pipeline:
         ----------
         measurements : iterable of Measurement
             All are read before the first one is processed, and all images are kept in memory.
+        out : (measurement, direction, range) float32, optional
+            Array for the amplitudes, which may be longer than the batch; new ones by default. Fresh memory often takes
+            longer than the images, so pass the same array for batches whose images are not kept.
 
         Returns
         -------
@@ -271,6 +276,8 @@ class Pipeline:
         ------
         DataError
             As for `process`; nothing is processed then.
+        ArgumentError
+            ``out`` has another shape or type, or fewer images than the batch.
 
         Examples
         --------
@@ -285,7 +292,7 @@ class Pipeline:
         self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         batch = list(checks.items("measurements", measurements, Measurement, "a recording contains"))
         words = [self._words_of(measurement) for measurement in batch]
-        amplitudes = [self._chain.new_image() for _ in batch]
+        amplitudes = [self._chain.new_image() for _ in batch] if out is None else self._checked_outs(out, len(batch))
         self._chain.process_batch([each for each, _ in words], amplitudes)
         return [
             self._checked_image(rescaled(amplitude, exponent), measurement, clean=True)
@@ -545,6 +552,12 @@ class Pipeline:
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; use contiguous float32 of shape {wanted}")
         return out
+
+
+    def _checked_outs(self, out: NDArray[np.float32], count: int) -> list[NDArray[np.float32]]:
+        if np.ndim(out) != 3 or len(out) < count:
+            raise ArgumentError(f"out has shape {np.shape(out)}; use {count} or more images, (image, direction, range)")
+        return [self._checked_out(each) for each in out[:count]]
 
 
 class _Heard(NamedTuple):

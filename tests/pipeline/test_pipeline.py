@@ -211,6 +211,33 @@ def test_batch_equals_single_measurements():
     assert len({image.amplitude.tobytes() for image in batch}) == len(batch)
 
 
+def test_batch_is_written_into_the_given_array():
+    pipeline, measurements = Pipeline(SHORT, predict=False), [noise(SHORT, seed) for seed in range(3)]
+    new = pipeline.process_batch(measurements)
+    given = np.full((4, *new[0].amplitude.shape), 7.0, np.float32)
+    batch = pipeline.process_batch(measurements, given)
+    assert [image.amplitude.tobytes() for image in batch] == [image.amplitude.tobytes() for image in new]
+    assert all(np.shares_memory(image.amplitude, each) for image, each in zip(batch, given, strict=False))
+    assert (given[3] == 7.0).all()
+
+
+@pytest.mark.parametrize(
+    ("cut", "dtype", "message"),
+    [
+        (np.s_[:1], np.float32, "use 2 or more images"),
+        (np.s_[0], np.float32, "use 2 or more images"),
+        (np.s_[:, 1:], np.float32, "use contiguous float32 of shape"),
+        (np.s_[:], np.float64, "use contiguous float32 of shape"),
+    ],
+)
+def test_batch_refuses_arrays_that_do_not_fit(cut, dtype, message):
+    with Pipeline(SHORT, predict=False) as pipeline:
+        given = np.full((2, len(pipeline.grid), len(pipeline.range_m)), 7.0, dtype)
+        with pytest.raises(ArgumentError, match=message):
+            pipeline.process_batch([noise(SHORT), noise(SHORT, 1)], given[cut])
+    assert (given == 7.0).all()
+
+
 def test_batch_with_a_wrong_measurement_processes_none():
     wrong = Measurement(np.zeros(10, np.uint32), SHORT)
     with pytest.raises(DataError, match="uint32 words of shape"):
