@@ -68,8 +68,7 @@ class Tally:
         self._was_read = True
         self.damage = blocks.pop(0, {}).get("damage", "")
         for place, block in blocks.items():
-            # Tallies written before version 2 of the formats name the session "epoch".
-            mark = SequenceRange(**{"session_id" if key == "epoch" else key: value for key, value in block.items()})
+            mark = SequenceRange(**block)
             self._places[mark.sensor, mark.session_id] = place
             self.ranges[mark.sensor, mark.session_id] = mark
 

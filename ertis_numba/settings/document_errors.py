@@ -107,7 +107,6 @@ def line_of_error(kind: "type[TomlDocument]", text: str, error: msgspec.Validati
     begin, stop = starts[table], stops[table]
     reported, _, path = str(error).partition(" - at `$")
     named = {*re.findall(r"\w+", reported.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
-    named |= {former for former, key in kind.former_keys.items() if key in named}
     keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
     is_table = bool(lines and _HEADER.match(lines[begin - 1]))
     return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else 0)

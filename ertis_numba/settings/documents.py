@@ -75,10 +75,6 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             New values by key. Keys of nested tables are given as ``**{"processing.range_m": (0.5, 3)}``. All changes
             of a table are checked together.
 
-        Returns
-        -------
-        Self
-
         Raises
         ------
         ArgumentError
@@ -152,18 +148,12 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    former_keys : dict of str to str
-        Present names of keys by former names, so that documents in older recordings stay readable.
-    former_values : dict of (str, str) to dict
-        Keys and values by the former key and value that they replace; none if it had no effect.
     max_bytes : int
         Limit on the length of a document in UTF-8.
     max_items : int
         Limit on its lines and commas, on which the time to parse it depends.
     """
 
-    former_keys: ClassVar[dict[str, str]] = {}
-    former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = {}
     max_bytes: ClassVar[int] = 16 * 2**20
     max_items: ClassVar[int] = 2**20
 
@@ -230,11 +220,11 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
     @classmethod
     def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
-        """Return the content of a file, and its tables as written but with the present names of keys."""
+        """Return the content of a file, and its tables as written."""
         wanted = f"a {cls.__name__.lower()} file (TOML)"
         text = _text_of(path, wanted)
         try:
-            return cls.from_toml(text, str(path)), cls._tables(text)
+            return cls.from_toml(text, str(path)), msgspec.toml.decode(text)
         except SettingsError as error:
             if type(error.__cause__) is not msgspec.DecodeError or path.suffix.lower() == ".toml":
                 raise
@@ -242,31 +232,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
     @classmethod
     def _decoded(cls, text: str) -> Self:
-        return msgspec.convert(cls._tables(text), cls, builtin_types=_TOML_TYPES, str_keys=True)
-
-    @classmethod
-    def _tables(cls, text: str) -> dict[str, Any]:
-        """Return the tables of a text with the present names of keys and values."""
-        tables: dict[str, Any] = msgspec.toml.decode(text)
-        return cls._present(tables) if cls.former_keys or cls.former_values else tables
-
-    @classmethod
-    def _present(cls, value: Any) -> Any:
-        """Replace former keys and values; one beside its present name is left, and so refused as ambiguous."""
-        if isinstance(value, list):
-            return [cls._present(item) for item in value]
-        if not isinstance(value, dict):
-            return value
-        table = {key: cls._present(item) for key, item in value.items()}
-        for former, key in cls.former_keys.items():
-            if former in table and key not in table:
-                table[key] = table.pop(former)
-        for (key, former), present in cls.former_values.items():
-            others = [(name, new) for name, new in present.items() if name != key]
-            if table.get(key) == former and all(table.get(name, new) == new for name, new in others):
-                del table[key]
-                table.update(present)
-        return table
+        return msgspec.convert(msgspec.toml.decode(text), cls, builtin_types=_TOML_TYPES, str_keys=True)
 
     def to_toml(self) -> str:
         """Return TOML text that `from_toml` reads back to an equal structure."""

@@ -75,16 +75,6 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
 
     max_bytes: ClassVar[int] = 262_144  # An array of 1024 microphones needs 170,000 bytes …
     max_items: ClassVar[int] = 30_000  # … and 16,500 items.
-    former_keys: ClassVar[dict[str, str]] = {
-        "pdm_rate_hz": "sample_rate_hz",
-        "stop_band_db": "stopband_attenuation_db",
-        "zones": "focal_zones",
-        "loading": "diagonal_loading",
-    }
-    former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = {
-        ("interpolation", "fitted"): {},
-        ("beamformer", "coherence_factor"): {"beamformer": "delay_and_sum", "weighting": "coherence_factor"},
-    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,10 +186,6 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             TOML file. Names of files in it, of layouts, waveforms, filters and directions, are relative to its
             folder.
 
-        Returns
-        -------
-        Settings
-
         Raises
         ------
         SettingsError
@@ -225,10 +211,6 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         ----------
         path : str or Path
             TOML file. Names of files in it are relative to its folder.
-
-        Returns
-        -------
-        Settings
 
         Raises
         ------
@@ -292,10 +274,6 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             Sections to replace as a whole, such as ``air=Air(temperature_c=25)`` or
             ``processing=Processing.from_preset("2d_181_5m")``. Unless ``processing`` is among them, its ranges suit
             record and call; see `fit_ranges`.
-
-        Returns
-        -------
-        Settings
 
         Raises
         ------

@@ -4,7 +4,7 @@ Levels and strengths are relative to full scale. A signal of amplitude 1, or 0 d
 """
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, Self
 
 import msgspec
 import numpy as np
@@ -61,9 +61,6 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     >>> scene.moves
     False
     """
-
-    former_keys: ClassVar[dict[str, str]] = Sensor.former_keys
-    former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = Sensor.former_values
 
     seed: Annotated[int, Limits(0, 2**63 - 1)] = 0
     rate_hz: Annotated[float, Limits(1e-6, 1e6)] = 20.0
@@ -181,10 +178,6 @@ def load_scene(path: str | Path) -> Scene:
     ----------
     path : str or Path
         TOML file.
-
-    Returns
-    -------
-    Scene
 
     Raises
     ------

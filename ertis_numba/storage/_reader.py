@@ -17,10 +17,10 @@ from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.opening import RESULT_OR_RECORDING, open_file, reading
-from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
+from ertis_numba.storage.schema import FORMAT_VERSION, OLDEST_VERSION, Variable, content_sha256
 from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import GroundTruth, read_truth
-from ertis_numba.storage.variables import SensorGroup, to_python
+from ertis_numba.storage.variables import to_python
 
 __all__ = ["FileReader", "file_kind", "sensor_names"]
 
@@ -87,7 +87,7 @@ class FileReader(Sequence[Item]):
                 self._require_kind()
                 self.sensors: tuple[str, ...] = sensors_of(self._file)
                 self.sensor = self._select_sensor(sensor)
-                self._group = SensorGroup(local_member(self._file["sensors"], self.sensor, h5py.Group))
+                self._group = local_member(self._file["sensors"], self.sensor, h5py.Group)
                 self._select_table()
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data, self._row_name)
@@ -240,6 +240,11 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     if version > FORMAT_VERSION:
         raise FormatVersionError(
             f"{path} has format version {version}, but this package reads up to {FORMAT_VERSION}; update ertis-numba"
+        )
+    if version < OLDEST_VERSION:
+        raise FormatVersionError(
+            f"{path} has format version {version}, but this package reads {OLDEST_VERSION} to {FORMAT_VERSION}; make "
+            "the file again from its source"
         )
     return str(kind)
 

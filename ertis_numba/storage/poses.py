@@ -22,7 +22,7 @@ from ertis_numba.storage.acoustic_maps import AcousticMapReader, open_acoustic_m
 from ertis_numba.storage.energyscape import EnergyscapeReader, open_energyscapes
 from ertis_numba.storage.recording import RecordingReader, open_recording
 from ertis_numba.storage.schema import FORMAT_VERSION, POSES, RECORDING, content_sha256, content_uuid, sensor_path
-from ertis_numba.storage.variables import SensorGroup, set_attributes, to_python
+from ertis_numba.storage.variables import set_attributes, to_python
 
 __all__ = ["add_poses", "count_in_gaps", "platform_trajectory", "recorded_trajectory", "require_fitting_poses"]
 
@@ -260,7 +260,7 @@ def _add_to_sensors(file: h5py.File, trajectory: Trajectory) -> None:
     """Add poses to all sensors, and update the attributes that depend on the content."""
     contents: dict[str, str] = {}
     for sensor in file["sensors"]:
-        group = SensorGroup(file[sensor_path(sensor)])
+        group = file[sensor_path(sensor)]
         remove_poses(group)
         write_poses(group, trajectory)
         contents[sensor] = content_sha256(group, (*RECORDING, *POSES))

@@ -1,6 +1,5 @@
 """Recordings: measurements as recorded, with everything that processing needs."""
 
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -84,14 +83,12 @@ class RecordingReader(FileReader[Measurement]):
 
     def _load(self) -> None:
         self._require_agreement()
-        columns = (self._group[f"gap_{name}"][:].tolist() for name in ("first", "last", "reason"))
-        session_ids = (
-            self._group["gap_session_id"][:].tolist() if "gap_session_id" in self._group else itertools.repeat(0)
-        )
+        names = ("gap_first", "gap_last", "gap_reason", "gap_session_id")
+        columns = (self._group[name][:].tolist() for name in names)
         try:
             self.gaps = tuple(
                 SequenceGap(self.sensor, first, last, reason.decode(), session_id)
-                for (first, last, reason), session_id in zip(zip(*columns, strict=True), session_ids, strict=False)
+                for first, last, reason, session_id in zip(*columns, strict=True)
             )
         except ArgumentError as error:
             problem = str(error).partition(";")[0]
@@ -136,10 +133,6 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingR
         Path of the file.
     sensor : str, optional
         Name of the sensor; required if the file contains several.
-
-    Returns
-    -------
-    RecordingReader
 
     Raises
     ------

@@ -27,8 +27,8 @@ __all__ = [
     "CONVENTIONS",
     "ENERGYSCAPE",
     "FORMAT_VERSION",
-    "FORMER_NAMES",
     "OCCUPANCY_MAP",
+    "OLDEST_VERSION",
     "POINTS",
     "POSES",
     "RECORDING",
@@ -46,7 +46,8 @@ __all__ = [
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
-FORMAT_VERSION: Final = 4  # Version 1 used the names in FORMER_NAMES; version 2 had no behaviour; 3 had no poses.
+FORMAT_VERSION: Final = 4  # Version 2 had no behaviour, and 3 had no poses.
+OLDEST_VERSION: Final = 2  # Variables and settings had other names before.
 VERSION_WITHOUT_POSES: Final = 3  # Earlier versions of this package read files without poses.
 CHUNK_ROWS: Final = 512  # Applies to columns with one number per measurement.
 _DIGEST_ITEMS: Final = 2**20
@@ -94,7 +95,7 @@ RECORDING: Final = (
     Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
     Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
     Variable("gap_reason", ("gap",), "str", "reason of the loss"),
-    Variable("gap_session_id", ("gap",), "<i8", "session of the missing numbers", optional=True),
+    Variable("gap_session_id", ("gap",), "<i8", "session of the missing numbers"),
 )
 
 RECORDING_OF_PCM: Final = tuple(
@@ -298,9 +299,6 @@ TRUTH: Final = (
 )
 """Variables of the group ``truth`` of a sensor."""
 
-FORMER_NAMES: Final = {"amplitude": "energy", "session_id": "epoch", "gap_session_id": "gap_epoch"}
-"""Names that variables have in files of format version 1."""
-
 
 def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
     """Return the SHA-256 over the variables of a sensor, in hexadecimal."""
@@ -317,7 +315,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
     for variable in table:
         if variable.dtype and (variable.name in group or not variable.optional):
             dataset = group[variable.name]
-            digest.update(dataset.name.rsplit("/", 1)[-1].encode())  # The stored name keeps older files valid.
+            digest.update(variable.name.encode())
             # The truth of many measurements may exceed the memory, so it is read in parts.
             rows = max(1, _DIGEST_ITEMS // max(1, math.prod(dataset.shape[1:])))
             for first in range(0, dataset.shape[0], rows) if dataset.shape else ():

@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 
 from ertis_numba.base.errors import ArgumentError
-from ertis_numba.storage.schema import CHUNK_ROWS, FORMER_NAMES, Variable
+from ertis_numba.storage.schema import CHUNK_ROWS, Variable
 
-__all__ = ["SensorGroup", "create_variables", "set_attributes", "text_type", "to_python"]
+__all__ = ["create_variables", "set_attributes", "text_type", "to_python"]
 
 _TIME_CHUNK_ROWS: Final = 4096  # Applies to the axis, which programs read as a whole.
 
@@ -25,30 +25,6 @@ _MAX_CHUNK_BYTES: Final = 2**32 - 1
 
 
 _UNLIMITED: Final = ("time", "gap")
-
-
-class SensorGroup(h5py.Group):  # type: ignore[misc]  # h5py has no annotations
-    """Group of a sensor whose variables answer to their present names, in files of all format versions."""
-
-    def __init__(self, group: h5py.Group) -> None:
-        super().__init__(group.id)
-
-    def stored_name(self, name: str) -> str:
-        """Return the name of a variable in this file."""
-        former = FORMER_NAMES.get(name)
-        if former is None:  # Each look-up in the file takes time, and most variables never had another name.
-            return name
-        return former if super().__contains__(former) and not super().__contains__(name) else name
-
-    def __getitem__(self, name: str) -> Any:
-        return super().__getitem__(self.stored_name(name))
-
-    def __contains__(self, name: str) -> bool:
-        return bool(super().__contains__(self.stored_name(name)))
-
-    def get(self, name: str, *args: Any, **options: Any) -> Any:
-        """Return a member or its link, as `h5py.Group.get` does."""
-        return super().get(self.stored_name(name), *args, **options)
 
 
 def create_variables(

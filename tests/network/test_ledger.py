@@ -25,14 +25,6 @@ def test_saved_ledger_is_read_back(tmp_path):
     assert read.gaps == ledger.gaps == gaps
 
 
-def test_ledger_of_version_1_is_read(tmp_path):
-    (tmp_path / ".ertis-ledger").write_text(
-        '{"version": 1, "settled": {"left": {"3": 7}}, "open": ["a"], "unsealed": []}'
-    )
-    read = Ledger(tmp_path)
-    assert (read.acked_through, read.open, read.gaps) == ({SensorSession("left", 3): 7}, ["a"], [])
-
-
 @pytest.mark.parametrize(
     "content",
     [

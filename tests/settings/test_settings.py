@@ -187,7 +187,10 @@ def test_settings_are_immutable():
         ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; use a whole number from 0 to 8"),
         ("[accuracy]\nbeam_taps = 3", r"accuracy\.beam_taps '3' is unknown.*known are 0, 2, 4, 6"),
         ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; use a number from 1\.1 to 8"),
-        ("[accuracy]\nstop_band_db = 30", r"accuracy\.stopband_attenuation_db is 30; use a number from 40 to 140"),
+        (
+            "[accuracy]\nstopband_attenuation_db = 30",
+            r"accuracy\.stopband_attenuation_db is 30; use a number from 40 to 140",
+        ),
         ("[accuracy]\nfocal_zones = 0", r"accuracy\.focal_zones is 0; use a whole number from 1 to"),
         (
             "[processing]\nmethod = 'paper'\nwavefront = 'spherical'",
@@ -355,13 +358,6 @@ def test_distant_microphones_are_refused():
     assert Array(positions_m=((5e5, 5e6, 0.0), (5e5, 5e6 + 20, 0.0)), enabled=(True, True)).layout == "own array"
 
 
-def test_settings_of_older_recordings_are_read():
-    text = Settings().to_toml()
-    assert "pdm_rate_hz" not in text
-    former = text.replace("sample_rate_hz = 4500000.0", "pdm_rate_hz = 1125000.0")
-    assert Settings.from_toml(former).recording.sample_rate_hz == 1_125_000
-
-
 def test_files_named_in_settings_are_relative_to_the_settings_file(tmp_path, monkeypatch):
     folder = tmp_path / "mine"
     folder.mkdir()
@@ -388,7 +384,7 @@ def test_settings_file_updates_only_its_keys(tmp_path, monkeypatch):
         recording=Recording(n_samples=100_000),
         processing=Processing(directions="near.csv", range_m=(1.0, 2.0)),
     )
-    (folder / "s.toml").write_text("\ufeff[recording]\npdm_rate_hz = 4e6\n[processing]\nrange_m = [1, 3]\n", "utf-8")
+    (folder / "s.toml").write_text("\ufeff[recording]\nsample_rate_hz = 4e6\n[processing]\nrange_m = [1, 3]\n", "utf-8")
     changed = known.updated_from_file("mine/s.toml")
     assert changed.recording == Recording(sample_rate_hz=4e6, n_samples=100_000)
     assert changed.processing == known.processing.replace(range_m=(1.0, 3.0))

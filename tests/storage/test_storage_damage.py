@@ -152,10 +152,13 @@ def test_attributes_of_other_programs_are_no_damage(path, add):
     assert all(report.is_intact for report in verify(path))
 
 
-def test_newer_format_version_is_refused(path):
+@pytest.mark.parametrize(
+    ("version", "problem"), [(5, "this package reads up to 4; update"), (1, "this package reads 2 to 4; make the file")]
+)
+def test_unknown_format_version_is_refused(version, problem, path):
     with h5py.File(path, "r+") as file:
-        file.attrs["ertis_format_version"] = 5
-    with pytest.raises(FormatVersionError, match="has format version 5, but this package reads up to 4; update"):
+        file.attrs["ertis_format_version"] = version
+    with pytest.raises(FormatVersionError, match=f"has format version {version}, but {problem}"):
         open_recording(path)
 
 

@@ -22,7 +22,6 @@ from ertis_numba.storage import (
 from ertis_numba.storage.schema import POSES, RECORDING, content_sha256
 from ertis_numba.storage.verify import verify
 from tests.files import SMALL, noise, open_dataset
-from tests.pages import ROOT
 
 TIMES_NS = [measurement.stamp.timestamp_ns for measurement in noise()]
 SECOND_NS = 10**9
@@ -194,18 +193,6 @@ def test_files_without_poses_keep_their_version_and_checksum(tmp_path):
         assert file.attrs["ertis_format_version"] == 3
         assert {*group}.isdisjoint(variable.name for variable in POSES)
         assert group.attrs["content_sha256"].decode() == content_sha256(group, RECORDING)
-
-
-def test_poses_can_be_added_to_files_of_version_1(tmp_path):
-    former = ROOT / "tests" / "former_files" / "recording.h5"
-    with open_recording(former) as recording:
-        times_ns = [stamp.timestamp_ns for stamp in recording.stamps()]
-        content = [each.data for each in recording]
-    given = drive(begin_ns=min(times_ns) - SECOND_NS, end_ns=max(times_ns) + SECOND_NS)
-    path = ertis.add_poses(former, given, output=tmp_path / "posed.h5")
-    with open_recording(path) as recording:
-        assert recording.trajectory.time_ns.tolist() == sorted({*times_ns})
-        assert all(np.array_equal(each.data, data) for each, data in zip(recording, content, strict=True))
 
 
 def test_uncovered_measurements_are_refused_with_both_spans(plain):

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import h5py
 import pytest
@@ -149,14 +148,6 @@ def test_sealed_recording_of_two_sessions_is_intact(tmp_path):
     with open_recording(path) as recording:
         assert recording.stamps() == [measurement.stamp for measurement in recording]
         assert recording.stamps() == [entry.measurement.stamp for entry in given]
-
-
-def test_recordings_without_session_identifiers_are_verified():
-    path = Path(__file__).parents[1] / "recordings" / "before_epochs.h5"
-    with h5py.File(path) as file:
-        (group,) = file["sensors"].values()
-        assert (group["epoch"].dtype.str, "gap_epoch" in group) == ("<i4", False)
-    assert all(report.is_intact for report in verify(path))
 
 
 def test_disk_error_is_not_reported_as_damage(tmp_path, monkeypatch):

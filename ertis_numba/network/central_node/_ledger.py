@@ -7,7 +7,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import msgspec
 
@@ -26,7 +26,7 @@ __all__ = ["Ledger", "Lock", "read_acked_through"]
 
 _NAME: Final = ".ertis-ledger"
 _LOCK: Final = ".ertis-lock"
-_VERSION: Final = 3  # Version 1 had no gaps, version 2 no checksums.
+_VERSION: Final = 3
 _MAX_SESSIONS: Final = 64  # Limit per sensor.
 _ALL_RUNS_KEPT: Final = 16_384
 
@@ -70,16 +70,6 @@ class _End(msgspec.Struct, tag="end", array_like=True):
 _Line: TypeAlias = _Begin | _AckedSession | _Open | _Unsealed | _Gap | _Tail | _End
 
 
-class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """Content of versions 1 and 2: one JSON object; numbers by sensor and session, which is text."""
-
-    version: Annotated[int, msgspec.Meta(ge=1, le=2)] = 2
-    acked_through: dict[str, dict[str, int]] = msgspec.field(name="settled", default_factory=dict)
-    open: list[str] = []
-    unsealed: list[str] = []
-    gaps: list[tuple[str, str, int, int, str]] = []
-
-
 class Ledger:
     """Durable record of the highest acknowledged number of the newest 64 sessions of each sensor.
 
@@ -105,12 +95,6 @@ class Ledger:
             content = self._path.read_bytes()
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; make it readable") from error
-        if content.startswith(b"{"):
-            try:
-                self._read_old(msgspec.json.decode(content, type=_Old))
-            except (msgspec.MsgspecError, ValueError):  # This includes text that is not UTF-8.
-                self._note_damage("it cannot be read")
-            return
         lines = content.split(b"\n")[:-1]
         n_bad, n_ended = 0, -1
         for number, text in enumerate(lines):
@@ -128,17 +112,6 @@ class Ledger:
             self._note_damage(f"{n_bad} of {len(lines)} entries cannot be read")
         elif n_ended != len(lines) or not lines:
             self._note_damage("its end is missing")
-
-    def _read_old(self, old: _Old) -> None:
-        acked_through = {
-            SensorSession(name, int(session_id)): last
-            for name, runs in old.acked_through.items()
-            for session_id, last in runs.items()
-        }
-        self.gaps = [
-            SequenceGap(sensor, first, last, why, int(session_id)) for sensor, session_id, first, last, why in old.gaps
-        ]
-        self.acked_through, self.open, self.unsealed = acked_through, old.open, old.unsealed
 
     def _add(self, entry: _Line) -> None:
         match entry:

@@ -167,7 +167,6 @@ def _shapes() -> Iterator[tuple[str, str]]:
         yield f"list: {count // 9} flat positions", f"[array]\npositions_m = [{'[0,0],' * (count // 9)}]\n"
         yield f"digits: {count}", f"x = {'9' * count}\n"
         yield f"digits: {count} hexadecimal", f"x = 0x{'f' * (count - 10)}\n"
-        yield f"former key: {count // 12} times", "pdm_rate_hz " * (count // 12) + "= 1\n"
     yield "text: half a surrogate", '[array]\nlayout = "\\ud800"\n'
     yield "text: without an end", '[array]\nlayout = "'
     yield "text: a byte-order mark", "\ufeff" * 1000
