@@ -115,11 +115,6 @@ def threshold_factor(method: Method, n_reference: int, false_alarm: float) -> fl
     float
         α, a ratio of powers.
 
-    Raises
-    ------
-    ArgumentError
-        An argument is invalid.
-
     Examples
     --------
     >>> from ertis_numba.analysis.cfar import threshold_factor
@@ -212,10 +207,6 @@ def cfar_peaks(
         Maximum number of reflectors; 10 by default, None for all.
     min_level_db : float
         Minimum level relative to the strongest reflector; -200 dB by default.
-
-    Returns
-    -------
-    list of Peak
 
     Raises
     ------

@@ -115,10 +115,6 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     min_level_db : float
         Minimum level of a reflector, relative to the strongest visible reflector; -30 dB by default.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     ArgumentError

@@ -67,10 +67,6 @@ def find_peaks(
         direction explains, see `ertis_numba.analysis.directional_noise.stands_out`, and side lobes that noise may have
         raised. Cleaned images keep all maxima. None also lists the maxima that noise alone may cause.
 
-    Returns
-    -------
-    list of Peak
-
     Raises
     ------
     ArgumentError

@@ -31,10 +31,6 @@ def clean(image: Energyscape, *, within_db: float | None = 6.0, above_mean_db: f
         Smallest level above the mean amplitude of the range, 0 to 1000 dB; no such limit by default. Above 0 dB, an
         image of one direction keeps no bin.
 
-    Returns
-    -------
-    Energyscape
-
     Raises
     ------
     ArgumentError

@@ -96,10 +96,6 @@ def calibrate(
     on_progress : callable, optional
         Function that is called with the number of measurements so far.
 
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     ArgumentError

@@ -260,11 +260,6 @@ def array(
         Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
         Range of the colours in dB and the style, as for `plot`.
-
-    Raises
-    ------
-    ArgumentError
-        An argument is invalid.
     """
     checks.positive("dynamic_range_db", dynamic_range_db)
     if isinstance(settings, str):
@@ -327,15 +322,6 @@ def occupancy(
         Sensors on the platform, drawn as dots at the last pose.
     **look
         Style of the figure, as for `plot`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ArgumentError
-        An argument is invalid.
     """
     checks.instance("found", found, OccupancyMap, "Mapper.map returns")
     if trajectory is not None:

@@ -52,10 +52,6 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     **look
         Style of the figure, as for `plot`.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-
     Raises
     ------
     ArgumentError

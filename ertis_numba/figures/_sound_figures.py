@@ -145,11 +145,6 @@ def spectrum(
         Direction in degrees. By default the loudest direction of a map, or the mean of the microphones.
     dynamic_range_db, **look
         Range of the colours in dB and the style, as for `plot`.
-
-    Raises
-    ------
-    ArgumentError
-        An argument is invalid.
     """
     canvas = canvas_of(dynamic_range_db, look)
     if isinstance(source, AcousticMap):
@@ -176,11 +171,6 @@ def spectrogram(
         Direction of the beam in degrees.
     dynamic_range_db, **look
         Range of the colours in dB and the style, as for `plot`.
-
-    Raises
-    ------
-    ArgumentError
-        An argument is invalid.
     """
     checks.instance("measurement", measurement, Measurement, "a recording contains")
     return _acoustic_signals.draw_spectrogram(

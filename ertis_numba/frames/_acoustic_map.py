@@ -219,10 +219,6 @@ class AcousticMap(DegreesFromRadians):
 
         It may be noise or a side lobe: ``bearings`` has the sources. A source may also lie between the directions of
         the grid, with a higher level: `find_sound_sources` interpolates.
-
-        Returns
-        -------
-        list of SoundDirection
         """
         return [
             SoundDirection.of(
@@ -242,10 +238,6 @@ class AcousticMap(DegreesFromRadians):
         ----------
         **changes
             New values of fields, by name.
-
-        Returns
-        -------
-        AcousticMap
 
         Raises
         ------

@@ -62,11 +62,6 @@ class Beams(DegreesFromRadians):
         checks.shape("beam", self.beam.shape, (*self.azimuth_rad.shape, *self.range_m.shape))
 
     def envelope(self) -> Energyscape:
-        """Return the image of the beams, which is their magnitude.
-
-        Returns
-        -------
-        Energyscape
-        """
+        """Return the image of the beams, which is their magnitude."""
         axes = self.azimuth_rad, self.elevation_rad, self.range_m
         return Energyscape(np.abs(self.beam), *axes, self.settings, self.stamp)

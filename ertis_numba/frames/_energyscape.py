@@ -118,10 +118,6 @@ class Energyscape(DegreesFromRadians):
         **changes
             New values of fields, such as ``amplitude=image.amplitude - background.amplitude``.
 
-        Returns
-        -------
-        Energyscape
-
         Raises
         ------
         ArgumentError

@@ -148,10 +148,6 @@ class OccupancyMap:
         **changes
             New values of fields, by name.
 
-        Returns
-        -------
-        OccupancyMap
-
         Raises
         ------
         ArgumentError

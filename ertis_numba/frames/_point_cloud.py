@@ -115,10 +115,6 @@ class PointCloud(DegreesFromRadians):
         **changes
             New values of fields.
 
-        Returns
-        -------
-        PointCloud
-
         Raises
         ------
         ArgumentError
@@ -141,10 +137,6 @@ class PointCloud(DegreesFromRadians):
         ----------
         chosen : (point,) bool, or int indices
             Points to keep.
-
-        Returns
-        -------
-        PointCloud
 
         Examples
         --------
@@ -170,10 +162,6 @@ class PointCloud(DegreesFromRadians):
             Largest number of points; None for all.
         min_level_db : float
             Lowest level relative to the strongest point in dB.
-
-        Returns
-        -------
-        PointCloud
 
         Examples
         --------

@@ -138,10 +138,6 @@ class Trajectory:
         **changes
             New values of fields, by name.
 
-        Returns
-        -------
-        Trajectory
-
         Raises
         ------
         ArgumentError
@@ -159,10 +155,6 @@ class Trajectory:
             right, y down, in a world whose z axis is up. "camera-world": the world has the axes of a camera as well, as
             in KITTI and in visual odometry whose world is its first camera. "ned": x forward, y right, z down, in a
             world of north, east and down, as on aircraft and vessels; the result has x north, y west, z up.
-
-        Returns
-        -------
-        Trajectory
 
         Raises
         ------
@@ -194,10 +186,6 @@ class Trajectory:
         ----------
         time_ns : (n,) int64
             Strictly increasing times within the trajectory, in nanoseconds since 1970-01-01 UTC.
-
-        Returns
-        -------
-        Trajectory
 
         Raises
         ------

@@ -135,10 +135,6 @@ def load_layout(name: str | Path) -> Layout:
     name : str or Path
         One of `layout_names`, or a path.
 
-    Returns
-    -------
-    Layout
-
     Raises
     ------
     ArgumentError

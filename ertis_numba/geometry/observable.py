@@ -65,10 +65,6 @@ def observable_angles(array: Array, grid: DegreesFromRadians | None = None) -> O
     grid : Grid, or a result with directions, optional
         Directions to compare; without them, the sides of a plane are not noted.
 
-    Returns
-    -------
-    ObservableAngles
-
     Examples
     --------
     >>> from ertis_numba.geometry import observable_angles

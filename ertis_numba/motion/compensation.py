@@ -40,10 +40,6 @@ def compensate_motion(points: PointCloud, velocity_m_s: Sequence[float], yaw_rat
     yaw_rate_rad_s : float, default 0
         Rotation to the left about the z axis of this frame, in radians per second.
 
-    Returns
-    -------
-    PointCloud
-
     Raises
     ------
     ArgumentError

@@ -84,10 +84,6 @@ def ego_velocity(
     alone : bool, optional
         True if no sensor emits except those with images, as for `Odometry`.
 
-    Returns
-    -------
-    EgoVelocity
-
     Raises
     ------
     ArgumentError

@@ -84,10 +84,6 @@ def listen_to(
     signals : HeardSignals, optional
         Demodulator of the measurement's settings, which saves time for many measurements.
 
-    Returns
-    -------
-    BeamSound
-
     Raises
     ------
     ArgumentError
@@ -140,10 +136,6 @@ def heterodyned(sound: BeamSound, shift_hz: float, rate_hz: float = 48e3) -> Bea
         Shift in hertz, up to half of the sound's rate.
     rate_hz : float
         Sample rate of the result; 48 kHz by default.
-
-    Returns
-    -------
-    BeamSound
 
     Raises
     ------

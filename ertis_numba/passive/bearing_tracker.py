@@ -121,12 +121,7 @@ class BearingTracker:
         ]
 
     def finish(self) -> list[SoundEvent]:
-        """End all events, and return them.
-
-        Returns
-        -------
-        list of SoundEvent
-        """
+        """End all events, and return them."""
         tracks, self._tracks = self._tracks, []
         return [track.event(is_over=True) for track in tracks if track.number]
 

@@ -117,10 +117,6 @@ class BearingFinder:
     def find(self) -> list[Bearing]:
         """Return the bearings of the measurements since the camera's last `reset`, band by band, loudest first.
 
-        Returns
-        -------
-        list of Bearing
-
         Raises
         ------
         DataError
@@ -152,10 +148,6 @@ def find_bearings(
     camera : AcousticCamera
     false_alarm, top, min_level_db
         As for `BearingFinder`, which is faster for many maps.
-
-    Returns
-    -------
-    list of Bearing
 
     Raises
     ------

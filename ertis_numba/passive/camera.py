@@ -198,10 +198,6 @@ class AcousticCamera:
     def cross_spectrum(self) -> CrossSpectrum:
         """Return the cross-spectral matrix of the measurements since the last `reset`.
 
-        Returns
-        -------
-        CrossSpectrum
-
         Raises
         ------
         DataError
@@ -232,10 +228,6 @@ class AcousticCamera:
 
     def map(self) -> AcousticMap:
         """Return the map of the measurements since the last `reset`.
-
-        Returns
-        -------
-        AcousticMap
 
         Raises
         ------
@@ -283,10 +275,6 @@ class AcousticCamera:
         ----------
         measurement : Measurement
 
-        Returns
-        -------
-        AcousticMap
-
         Raises
         ------
         DataError
@@ -302,10 +290,6 @@ class AcousticCamera:
         Parameters
         ----------
         measurements : iterable of Measurement
-
-        Returns
-        -------
-        iterator of AcousticMap
 
         Raises
         ------

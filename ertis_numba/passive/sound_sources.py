@@ -99,10 +99,6 @@ def find_sound_sources(
         Lowest level relative to the strongest source of the band; by default -10 dB, below which side lobes lie, and
         -20 dB for CLEAN-SC and HR-CLEAN-SC.
 
-    Returns
-    -------
-    list of SoundDirection
-
     Raises
     ------
     ArgumentError

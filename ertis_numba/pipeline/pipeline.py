@@ -188,10 +188,6 @@ class Pipeline:
             False to omit the cleaning that ``settings.processing`` may request. The settings of the image then request
             none.
 
-        Returns
-        -------
-        Energyscape
-
         Raises
         ------
         DataError
@@ -268,10 +264,6 @@ class Pipeline:
             Array for the amplitudes, which may be longer than the batch; new ones by default. Fresh memory often takes
             longer than the images, so pass the same array for batches whose images are not kept.
 
-        Returns
-        -------
-        list of Energyscape
-
         Raises
         ------
         DataError
@@ -314,10 +306,6 @@ class Pipeline:
         batch_size : int, optional
             Measurements per batch. By default, one for each thread, or 16 on a GPU, and fewer if a batch would
             exceed 1 GiB. Use 1 for a live source, whose images should not wait for further measurements.
-
-        Returns
-        -------
-        iterator of Energyscape
 
         Raises
         ------
@@ -410,10 +398,6 @@ class Pipeline:
         Parameters
         ----------
         measurement : Measurement
-
-        Returns
-        -------
-        Beams
 
         Raises
         ------
@@ -552,7 +536,6 @@ class Pipeline:
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; use contiguous float32 of shape {wanted}")
         return out
-
 
     def _checked_outs(self, out: NDArray[np.float32], count: int) -> list[NDArray[np.float32]]:
         if np.ndim(out) != 3 or len(out) < count:

@@ -65,10 +65,6 @@ def check_recording(
     on_progress : callable, optional
         Called with the number of sensors checked so far.
 
-    Returns
-    -------
-    RecordingCheck
-
     Raises
     ------
     DataError

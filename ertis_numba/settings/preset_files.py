@@ -42,10 +42,6 @@ def presets(kind: PresetKind | None = None) -> tuple[str, ...]:
         ``recording`` presets have the length of the record and the call, for `Settings.from_preset`. ``processing``
         presets have directions and ranges, for `Processing.from_preset`. All presets by default.
 
-    Returns
-    -------
-    tuple of str
-
     Raises
     ------
     ArgumentError

@@ -148,10 +148,6 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             One of ``ertis.presets("processing")``, such as ``2d_181_5m`` for 181 directions in the horizontal plane and
             ranges from 0.5 to 5 m. Names of RTIS Dev, such as ``2D_5m_181``, are accepted, too.
 
-        Returns
-        -------
-        Processing
-
         Raises
         ------
         ArgumentError

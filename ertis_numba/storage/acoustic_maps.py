@@ -216,10 +216,6 @@ def open_acoustic_maps(path: str | Path, *, sensor: str | None = None) -> Acoust
     sensor : str, optional
         Name of the sensor, if the file contains several.
 
-    Returns
-    -------
-    AcousticMapReader
-
     Raises
     ------
     DataError

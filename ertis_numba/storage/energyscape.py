@@ -309,10 +309,6 @@ def open_energyscapes(path: str | Path, *, sensor: str | None = None) -> Energys
     sensor : str, optional
         Name of the sensor, if the file contains several.
 
-    Returns
-    -------
-    EnergyscapeReader
-
     Raises
     ------
     DataError

@@ -92,10 +92,6 @@ def read_map(path: str | Path) -> OccupancyMap:
     ----------
     path : str or Path
 
-    Returns
-    -------
-    OccupancyMap
-
     Raises
     ------
     DataError

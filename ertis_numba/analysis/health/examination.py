@@ -69,10 +69,6 @@ def health(measurement: Measurement) -> Health:
     ----------
     measurement : Measurement
 
-    Returns
-    -------
-    Health
-
     Raises
     ------
     DataError
