@@ -450,16 +450,14 @@ def note_unknown_places(sensor: str, settings: "Settings", *, quiet: bool = Fals
 
 
 def note_height(settings: "Settings", grid: "DegreesFromRadians", *, quiet: bool = False) -> None:
-    """Print a note if the directions of several sensors lie in the horizontal plane, once for equal arrays."""
-    from ertis_numba.geometry import height_note, observable_angles
+    """Print a note once if the directions of several sensors lie in the horizontal plane."""
+    from ertis_numba.geometry import HEIGHT_NOTE, observable_angles
 
-    if grid.elevation_rad.any() or not observable_angles(settings.array).elevation:
+    noted = click.get_current_context().meta
+    if grid.elevation_rad.any() or not observable_angles(settings.array).elevation or "ertis_cli.height" in noted:
         return
-    text = height_note(settings.array)
-    noted: set[str] = click.get_current_context().meta.setdefault("ertis_cli.noted_heights", set())
-    if text not in noted:
-        noted.add(text)
-        note(text, quiet=quiet)
+    noted["ertis_cli.height"] = True
+    note(HEIGHT_NOTE, quiet=quiet)
 
 
 def note_unknown_bearings(sensor: str, settings: "Settings") -> None:

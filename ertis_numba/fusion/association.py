@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.fusion.confirmation import confirmation
 from ertis_numba.fusion.echo_paths import EchoPaths
 from ertis_numba.fusion.explanations import Search
+from ertis_numba.fusion.heights import at_any_height
 from ertis_numba.fusion.known_echoes import KnownEchoes
 from ertis_numba.fusion.locating import Locator, median_of
 from ertis_numba.fusion.overlaps import PredictedEchoes
@@ -19,6 +20,8 @@ from ertis_numba.fusion.sensor_echoes import PulseEchoes, SensorEchoes
 from ertis_numba.fusion.sight import Viewers
 
 __all__ = ["Reflectors"]
+
+Floats = NDArray[np.float64]
 
 _MANY_PAIRS: Final = 9  # If so many pairs should hear a reflector, more than those of two calls, one echo shows none.
 _N_UNCLEAR: Final = 4  # Echoes of a reflector in space from which none needs to be clear (`SensorEchoes.is_clear`).
@@ -54,6 +57,7 @@ class Reflectors:
     ) -> None:
         flat = {number for number, receiver in receivers.items() if receiver.is_flat}
         self._viewers = Viewers(sensors, emitters, flat)
+        self._receivers, self._is_planar = receivers, grid.is_planar
         self._echoes = heard = PulseEchoes.joined(echoes, len(sensors))
         rows = {each.receiver: np.flatnonzero(heard.receiver == each.receiver) for each in echoes}
         pulse_m, beam = np.ones((2, len(sensors)))
@@ -104,6 +108,13 @@ class Reflectors:
         is_own = heard.receiver == number
         is_loud = is_own & (heard.power > _LOUD * heard.power[is_own].max(initial=0.0)) & silent.is_unexplained
         return any(bool(is_loud[each.echo[each.emitter == number]].any()) for each in self.located)
+
+    def placed(self) -> tuple[Floats, Floats]:
+        """Return positions and covariances, in planar images those of reflectors at any height."""
+        if not (self._is_planar and self.located):
+            return self.position_m, self.covariance_m2
+        axes_m2 = {number: each.axes_m2 for number, each in self._receivers.items()}
+        return at_any_height(self.located, self._echoes, self._viewers.sensor_m, axes_m2)
 
     def own_emitters(self) -> frozenset[int]:
         """Return the emitters to whose calls the echoes of their own sensors are attributed."""

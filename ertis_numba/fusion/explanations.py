@@ -203,7 +203,9 @@ class Search:
             reflectivity = median_of(self._echoes.power[members] / np.maximum(gain, _TINY))
             here = here._replace(place_m=place_m[None], across=np.zeros((1, 3)), reflectivity=np.array([reflectivity]))
             extra_m = _REFINED_M
-        return LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
+        deviation = self._echoes.deviation[members]
+        located = LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter, deviation)
+        return located, np.unique(echo)
 
     def _is_likely(
         self, here: _Candidates, sight: kernels.SeenPlaces, fits: tuple[Numbers, Numbers, Numbers, Floats]
@@ -240,7 +242,8 @@ class Search:
             place_m = self._viewers.sensor_m[sensor[0]] + to_m * self._echoes.direction[echo]
             _, covariance_m2 = self._locator.located(member, sensor, place_m)
             if _is_apart(place_m, covariance_m2, self.found):
-                lone = LocatedReflector(place_m, covariance_m2, 0.0, member, sensor)
+                deviation = self._echoes.deviation[member]
+                lone = LocatedReflector(place_m, covariance_m2, 0.0, member, sensor, deviation)
                 self.found += self._locator.measured([lone])
         if len(self.found) > n_found:
             self.found = self._locator.refined(self.found)

@@ -13,31 +13,33 @@ from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap, summe
 from ertis_numba.fusion.sensor_echoes import PulseEchoes
 from ertis_numba.fusion.sight import Viewers, mirrored
 
-__all__ = ["NEAREST_M", "LocatedReflector", "Locator", "median_of"]
+__all__ = ["NEAREST_M", "OUTLIER", "LocatedReflector", "Locator", "median_of"]
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 NEAREST_M: Final = 0.05
 """Least distance of a reflector from a sensor."""
+OUTLIER: Final = 2.0
+"""Residual with half weight, in standard deviations."""
 
 _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
 _TINY: Final = 1e-30
 _ROUNDS: Final = 8
 _RESOLUTION_M: Final = 0.014  # Difference of paths that separates two echoes.
-_OUTLIER: Final = 2.0  # Residual with half weight, in standard deviations.
 # Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
 _LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
 
 
 class LocatedReflector(NamedTuple):
-    """Located reflector, and the echoes (member,) that locate it with the emitters of their calls."""
+    """Located reflector, and the echoes (member,) that locate it, with emitters and deviations of their calls."""
 
     place_m: Floats
     covariance_m2: Floats
     reflectivity: float
     echo: Numbers
     emitter: Numbers
+    deviation: Floats
 
 
 class Locator:
@@ -69,7 +71,7 @@ class Locator:
             deviation,
             _LEAST_INFORMATION_1_M2,
             NEAREST_M,
-            math.inf if is_alone else _OUTLIER,
+            math.inf if is_alone else OUTLIER,
             1 if is_alone else _ROUNDS,
             position_m,
             covariance_m2,
@@ -118,7 +120,9 @@ class Locator:
             place_m, covariance_m2 = self.located(each.echo, each.emitter, each.place_m, added[row])
             alike = [summed[row].sum(axis=0), *(sent[row][each.emitter == one].sum(axis=0) for one in {*each.emitter})]
             shifts_m = np.array(alike) @ covariance_m2
-            refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2 + shifts_m.T @ shifts_m))
+            covariance_m2 += shifts_m.T @ shifts_m
+            deviation = np.sqrt(self._echoes.deviation[each.echo] ** 2 + added[row])
+            refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2, deviation=deviation))
         return refined
 
     def _summed_m2(

@@ -171,15 +171,17 @@ def _floor(image: Energyscape) -> EchoFloor:
 
 def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> PointCloud:
     """Return a point for each reflector in the platform frame, strongest first; ``image`` limits unconfirmed ones."""
-    position_m = reflectors.position_m
+    position_m, covariance_m2 = reflectors.placed()
     amplitude = np.sqrt(reflectors.reflectivity)
     # Ghosts would grow with range, and with the correction of the emitter's directivity.
-    cell = grid.cell_of(position_m)
+    cell = grid.cell_of(reflectors.position_m)
     shown = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
     amplitude = np.where(reflectors.confirmed, amplitude, np.minimum(amplitude, shown)).astype(np.float32)
     order = np.argsort(-amplitude, kind="stable")
     order = order[shown[order] > _FAINTEST * np.sqrt(reflectors.reflectivity[order])]
-    uncertainty_m = _along_and_across(position_m, reflectors.covariance_m2)
+    # Planar images do not show heights, whose errors are none of these.
+    level_m = position_m * [1.0, 1.0, 0.0] if grid.is_planar else position_m
+    uncertainty_m = _along_and_across(level_m, covariance_m2)
     return PointCloud(
         position_m[order].astype(np.float32),
         amplitude[order],

@@ -60,6 +60,9 @@ class Receiver:
         self.directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
         self.is_flat = microphones(image.settings.array).is_flat
         """True if the array cannot distinguish front and back."""
+        offset_m = microphones(image.settings.array).enabled_positions_m @ mounting.rotation.T
+        self.axes_m2 = np.cov(offset_m.T)
+        """Second moments (axis, axis) of the positions of microphones, in the platform frame."""
         call, speed_m_s = image.settings.call, sound_speed_m_s(image.settings.air)
         self.pulse_m = speed_m_s / (call.high_frequency_hz - call.low_frequency_hz)
         """Width of the compressed pulse, as length of a path."""

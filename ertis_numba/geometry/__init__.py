@@ -22,9 +22,9 @@ from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 from ertis_numba.geometry.observable import (
+    HEIGHT_NOTE,
     ObservableAngles,
     direction_note,
-    height_note,
     observable_angles,
     require_places,
 )
@@ -37,6 +37,7 @@ from ertis_numba.geometry.weights import array_weights, effective_count
 __all__ = [
     "ALONE_RAD",
     "FAR",
+    "HEIGHT_NOTE",
     "MAX_DIRECTIONS",
     "PAPER_GRIDS",
     "SENSOR_FRAME",
@@ -52,7 +53,6 @@ __all__ = [
     "effective_count",
     "far_field_delays",
     "grid_count",
-    "height_note",
     "is_closed",
     "layout_file",
     "layout_names",

@@ -12,15 +12,18 @@ from ertis_numba.geometry.delays import unit_vectors
 from ertis_numba.geometry.layouts import microphones
 from ertis_numba.settings import Array
 
-__all__ = ["ObservableAngles", "direction_note", "height_note", "observable_angles", "require_places"]
+__all__ = ["HEIGHT_NOTE", "ObservableAngles", "direction_note", "observable_angles", "require_places"]
 
 _FLAT: Final = 1e-3  # Width of an array relative to its length, below which it has no width.
 _SAME: Final = 1e-9  # Largest distance of equal unit vectors.
 _POINT_M: Final = 1e-6  # Microphones closer than this are in one place.
 _IN_PLANE: Final = "has its microphones in a plane"
 _UPRIGHT: Final = 0.05  # Component of a unit vector, below which it is 0: 3°.
-_BESIDE: Final = np.radians(np.linspace(-60.0, 60.0, 4801))  # Azimuths that the sound of another elevation may fit.
-_ABOVE_RAD: Final = math.radians(5.0)
+HEIGHT_NOTE: Final = (
+    "all directions have elevation 0°, so points are at the height of the sensors; their standard deviations allow for "
+    "reflectors up to 12° above or below it"
+)
+"""Note on points of planar images of several sensors."""
 
 
 class ObservableAngles(NamedTuple):
@@ -132,16 +135,6 @@ def direction_note(array: Array, grid: DegreesFromRadians, *, is_passive: bool =
     return "; it also ".join(filter(None, (_of_grid(grid), sides))) or None
 
 
-def height_note(array: Array) -> str:
-    """Return a note on places in planar images: they are those of reflectors at the height of the sensor."""
-    # The note has the largest error 5° above or below, at azimuths up to 45°.
-    wrong_deg = math.degrees(_azimuth_error_rad(array))
-    return (
-        "all directions have elevation 0°, so positions and standard deviations hold for reflectors at the height of "
-        f"the sensors; the azimuth of one 5° above or below is wrong by up to {wrong_deg:.1f}°"
-    )
-
-
 def require_places(array: Array, sensor: str, *, is_planar: bool) -> None:
     """Raise ArgumentError if an array observes no places of echoes, not even at the elevation of planar images."""
     seen = observable_angles(array)
@@ -149,19 +142,6 @@ def require_places(array: Array, sensor: str, *, is_planar: bool) -> None:
         return
     remedy = "process with 2d:N directions" if seen.azimuth else "use an array with microphones in a plane"
     raise ArgumentError(f"sensor {sensor} {seen.note}, so its echoes have no places; {remedy}")
-
-
-def _azimuth_error_rad(array: Array) -> float:
-    """Return the largest error of azimuths up to 45° for waves 5° above or below directions of elevation 0."""
-    positions_m = microphones(array).enabled_positions_m
-    delays_m = positions_m - positions_m.mean(axis=0)
-    at_zero = delays_m @ unit_vectors(_BESIDE, np.zeros(len(_BESIDE))).T
-    errors = [
-        _BESIDE[np.sum((at_zero - (delays_m @ arriving)[:, None]) ** 2, axis=0).argmin()] - azimuth_rad
-        for azimuth_rad in np.radians([-45.0, -22.5, 0.0, 22.5, 45.0])
-        for arriving in unit_vectors(np.full(2, azimuth_rad), np.array([-_ABOVE_RAD, _ABOVE_RAD]))
-    ]
-    return float(np.abs(errors).max())
 
 
 def _of_grid(grid: DegreesFromRadians) -> str | None:

@@ -15,7 +15,7 @@ from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.html_parts import escaped, table
 from ertis_numba.base.units import counted
 from ertis_numba.frames import AcousticMap, Bearing, Energyscape, Peak, PointCloud, Stamp, doubt_notes
-from ertis_numba.geometry import direction_grid, direction_note, height_note, observable_angles
+from ertis_numba.geometry import HEIGHT_NOTE, direction_grid, direction_note, observable_angles
 from ertis_numba.notebook.page import Axis, page
 from ertis_numba.settings import Settings
 from ertis_numba.storage import RecordingReader
@@ -67,7 +67,7 @@ def _notes_of_image(image: Energyscape, found: Sequence[Peak]) -> Iterator[str |
     if image.points is not None:
         seen = observable_angles(array)
         yield _of_sensor(image.stamp, seen.note)
-        yield height_note(array) if image.is_planar and seen.elevation else None
+        yield HEIGHT_NOTE if image.is_planar and seen.elevation else None
     else:
         yield _of_sensor(image.stamp, direction_note(array, image))
         yield spacing_warning(image.settings, image)
