@@ -8,7 +8,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import PointSpread, spread_of
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
@@ -100,7 +100,7 @@ class CallResponse:
 
     @functools.cached_property
     def _point_spread(self) -> PointSpread:
-        return PointSpread(self._settings)
+        return spread_of(self._settings)
 
     def __call__(self, sources: Floats, directions: Floats) -> Floats:
         """Return amplitudes of an echo: (n,) float64."""

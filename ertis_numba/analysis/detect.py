@@ -12,7 +12,7 @@ from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
 from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.base import checks
@@ -133,7 +133,7 @@ def peaks_of_grid(
         checks.shape("where", where.shape, image.amplitude.shape)
         if where.dtype != np.bool_:
             raise ArgumentError(f"where has dtype {where.dtype}; use bool, such as image.amplitude > 0.01")
-    edges = EdgeFloor(directions, PointSpread(image.settings))(image)
+    edges = EdgeFloor(directions, spread_of(image.settings))(image)
     places = _local_maxima(image.amplitude, neighbours, np.maximum(floor, edges), where)
     if false_alarm is not None:
         places = places[stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]
@@ -200,7 +200,7 @@ def left_out_at_edges(
     if image.points is not None:
         return 0
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    edges = EdgeFloor(directions, PointSpread(image.settings))(image)
+    edges = EdgeFloor(directions, spread_of(image.settings))(image)
     floor = _floor(image, min_level_db, false_alarm)
     places = _local_maxima(image.amplitude, neighbours_of(directions), np.full(len(edges), floor), edges[None] > 0)
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
@@ -217,7 +217,7 @@ def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_
         return 0
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     floor = np.maximum(
-        _floor(image, min_level_db, false_alarm), EdgeFloor(directions, PointSpread(image.settings))(image)
+        _floor(image, min_level_db, false_alarm), EdgeFloor(directions, spread_of(image.settings))(image)
     )
     places = _local_maxima(image.amplitude, neighbours_of(directions), floor, None)
     places = places[~stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]

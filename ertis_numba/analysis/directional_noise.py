@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.noise import echo_floor
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry.air import sound_speed_m_s
 
@@ -47,7 +47,7 @@ def is_short(
 
 def pulse_steps(image: Energyscape) -> int:
     """Return the number of ranges within which the pulse of an echo falls to a third."""
-    frequency_hz, share = PointSpread(image.settings).spectrum
+    frequency_hz, share = spread_of(image.settings).spectrum
     band_hz = math.sqrt(12 * max(float(share @ frequency_hz**2 - (share @ frequency_hz) ** 2), 1.0))
     step_m = float(image.range_m[-1] - image.range_m[0]) / max(1, len(image.range_m) - 1)
     length_m = _PULSE * sound_speed_m_s(image.settings.air) / (2 * band_hz)

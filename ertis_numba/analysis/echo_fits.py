@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.chain.plan_response import deviation_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
@@ -55,7 +55,7 @@ class EchoFits:
         self, settings: Settings, directions: Floats, neighbours: NDArray[np.int64], wanted: NDArray[np.int64]
     ) -> None:
         self._directions = np.ascontiguousarray(directions)
-        self._spread = PointSpread(settings, path_m=sum(settings.processing.range_m))
+        self._spread = spread_of(settings, path_m=sum(settings.processing.range_m))
         self._beams = self._spread.beams(self._directions, deviation_of(settings, directions))
         self._is_planar = bool(np.ptp(directions[:, 2]) == 0)
         offsets = directions[neighbours[wanted]] - directions[wanted][:, None]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.outside_grid import OutsidePatterns, OutsideSource
-from ertis_numba.analysis.point_spread import PULSE_M, PointSpread
+from ertis_numba.analysis.point_spread import PULSE_M, spread_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import far_field_delays, microphones
 from ertis_numba.geometry.air import sound_speed_m_s
@@ -43,7 +43,7 @@ def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: flo
 def _patterns(settings: Settings, grid: bytes) -> OutsidePatterns | None:
     """Return the patterns of echoes of the call."""
     positions_m, speed_m_s = microphones(settings.array).enabled_positions_m, sound_speed_m_s(settings.air)
-    every_hz, shares = PointSpread(settings).spectrum
+    every_hz, shares = spread_of(settings).spectrum
     bands = [each for each in np.array_split(np.arange(len(shares)), _BANDS) if (shares[each] > 0).any()]
     if not bands:  # The filters leave nothing of the call.
         return None

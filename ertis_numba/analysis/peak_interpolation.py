@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.analysis.echo_fits import EchoFits
 from ertis_numba.analysis.plan_errors import plan_error
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
@@ -64,7 +64,7 @@ class PeakInterpolator:
         self._row = np.zeros(len(directions), dtype=np.int64)
         self._row[wanted] = np.arange(len(wanted))
         self._fits = QuadricFits.of(directions, neighbours, wanted)
-        self._spread = PointSpread(settings)
+        self._spread = spread_of(settings)
         is_predicted = settings.processing.method == "fast" and not settings.processing.is_adaptive
         self._echoes = EchoFits(settings, directions, neighbours, wanted) if is_predicted else None
         self._model = math.hypot(_MODEL, plan_error(settings)) if is_predicted else 0.0

@@ -1,5 +1,6 @@
 """Point-spread function: image of a single reflector, computed from array and call."""
 
+import functools
 import math
 
 import numpy as np
@@ -13,7 +14,7 @@ from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["PULSE_M", "PointSpread"]
+__all__ = ["PULSE_M", "PointSpread", "spread_of"]
 
 Floats = NDArray[np.float64]
 
@@ -146,6 +147,10 @@ class PointSpread:
         """Return the pulse of a spectrum, relative to its carrier: (path,) complex128."""
         count = len(self._turn)
         return np.asarray(np.fft.ifft(spectrum, count) * count * self._turn)
+
+
+spread_of = functools.lru_cache(maxsize=8)(PointSpread)
+"""Point-spread function of settings; all images of a pipeline share its tables, which take milliseconds."""
 
 
 def _absorption_1_m(air: Air, frequency_hz: Floats) -> Floats:

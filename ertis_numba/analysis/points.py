@@ -11,7 +11,7 @@ from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
 from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.base import checks
@@ -99,7 +99,7 @@ class PointExtractor:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._neighbours = neighbours_of(self._directions)
         self._interpolator = PeakInterpolator(settings, self._directions, self._neighbours)
-        spread = PointSpread(settings)
+        spread = spread_of(settings)
         self._edges, self._reach_m = EdgeFloor(self._directions, spread), spread.reach_m
         self._uncertainty = PositionUncertainty(
             settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0), noise_only=self._noise_only

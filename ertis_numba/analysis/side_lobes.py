@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.point_spread import PULSE_M, PointSpread
+from ertis_numba.analysis.point_spread import PULSE_M, PointSpread, spread_of
 from ertis_numba.frames import Energyscape
 
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ class SideLobes:
         self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64], *, noise: float = 0.0
     ) -> None:
         self._noise, self._directions = noise, directions
-        self._image, self._spread = image, PointSpread(image.settings)
+        self._image, self._spread = image, spread_of(image.settings)
         count = len(directions)
         self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
         self._sampled = directions[self._samples]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.peak_interpolation import Tops
 from ertis_numba.analysis.plan_errors import plan_error
-from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.point_spread import PointSpread, spread_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import array_weights, microphones, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s
@@ -88,7 +88,7 @@ class PositionUncertainty:
         self._settings, self._is_planar, self._noise_only = settings, is_planar, noise_only
         self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
         self._frequency_hz = math.sqrt(mean_square)
-        self._spread = PointSpread(settings, path_m=sum(settings.processing.range_m))
+        self._spread = spread_of(settings, path_m=sum(settings.processing.range_m))
         self._plan = 0.0 if noise_only else plan_error(settings)
         bias = _BIAS_OF_ONE_TAP if settings.accuracy.delay_taps == 1 else _BIAS
         self._bias = self._plan * (_BIAS_OF_FOUR_BEAM_TAPS if settings.accuracy.beam_taps == 4 else bias)
