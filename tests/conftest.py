@@ -128,6 +128,15 @@ def loop(_driven_processing):
     return _driven_processing.fresh()
 
 
+@pytest.fixture
+def sound_unchecked(monkeypatch):
+    """Let pipelines compare no sound with its settings: a third of the time of tests that make one image each.
+
+    `tests/analysis` tests these comparisons.
+    """
+    monkeypatch.setattr("ertis_numba.analysis.sound_checks.SoundChecks.check", lambda *_: [])
+
+
 @pytest.fixture(autouse=True)
 def _log_as_before():
     """Restore the log's handlers, because commands that a test runs in this process replace them."""

@@ -13,6 +13,8 @@ from tests import reference
 from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, rated
 from tests.simulation.test_real import RAW
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 OPTIMISTIC_DB, PESSIMISTIC_DB = 1.0, 3.0
 FLOOR_DB = -105.0  # close to the error of the reference image, which rounds like all plans
 SCENES = 22

@@ -22,6 +22,8 @@ from tests import cases
 from tests.files import noise
 from tests.scenes import SENSOR, line_array, only, scene_of
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 KERNELS = {name: kernels.load(name) for name in kernels.usable()}
 LINE_16 = SENSOR.replace(
     array=line_array(16, 0.004),

@@ -17,6 +17,8 @@ from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Accuracy, Array, Processing, Recording, Settings
 from tests.pages import page
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 CPU = kernels.load("cpu")
 BASE = Settings(
     recording=Recording(sample_rate_hz=450e3, n_samples=6_000, encoding="float32"),
@@ -60,10 +62,12 @@ def heard(array, n_echoes, noise):
         amplitude = 0.1 if n_echoes == 1 else 0.01 * random.standard_normal()
         place_m = range_m * np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0])
         paths_m = range_m + np.linalg.norm(place_m - positions_m, axis=1)
-        for signal, delay_s in zip(signals, paths_m / sound_speed_m_s(settings.air), strict=True):
-            first = int(delay_s * rate_hz)
-            last = min(n_samples, first + int(settings.call.duration_s * rate_hz) + 2)
-            signal[first:last] += amplitude * call_at(settings.call, np.arange(first, last) / rate_hz - delay_s)
+        delays_s = paths_m / sound_speed_m_s(settings.air)
+        firsts = (delays_s * rate_hz).astype(int)
+        samples = firsts[:, None] + np.arange(int(settings.call.duration_s * rate_hz) + 2)
+        echoes = amplitude * call_at(settings.call, samples / rate_hz - delays_s[:, None])
+        for signal, first, echo in zip(signals, firsts, echoes, strict=True):
+            signal[first : first + len(echo)] += echo[: n_samples - first]
     return (signals * gain[:, None]).T.astype(np.float32)
 
 

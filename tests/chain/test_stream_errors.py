@@ -16,7 +16,7 @@ CPU = kernels.load("cpu")
 PCM = Settings(
     recording=Recording(sample_rate_hz=450e3, n_samples=5_400, encoding="float32"),
     processing=Processing(
-        directions="3d:120",
+        directions="3d:60",
         azimuth_limits_deg=(-50, 50),
         elevation_limits_deg=(-30, 30),
         range_m=(0.7, 1.3),
@@ -38,7 +38,10 @@ SCENES = {
     "echoes in noise": ([(10, 0, 0.9, 1.0), (-40, 10, 1.1, 0.5)], 0.3),
     "noise only": ([], 0.3),
 }
-pytestmark = pytest.mark.skipif(not CPU.tile_ranges, reason="this processor has no 16-bit dot product")
+pytestmark = [
+    pytest.mark.skipif(not CPU.tile_ranges, reason="this processor has no 16-bit dot product"),
+    pytest.mark.usefixtures("sound_unchecked"),
+]
 
 
 def heard(settings, echoes, noise, *, dead=(), loud=()):

@@ -23,6 +23,8 @@ from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, S
 from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.storage import open_energyscapes, write_recording
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 CPU = kernels.load("cpu")
 PCM = Settings(
     call=Call(start_frequency_hz=60e3, stop_frequency_hz=25e3, duration_s=2e-3),

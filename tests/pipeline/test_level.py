@@ -28,6 +28,8 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_recordi
 from ertis_numba.storage.variables import to_python
 from tests.publishing import results_of
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 TILTS_DEG = ((25.0, 0.0), (0.0, -15.0), (-20.0, 18.0))  # roll, pitch
 YAW_DEG = 70.0
 UNTURNED = (0.0, 0.0, 0.0, 1.0)

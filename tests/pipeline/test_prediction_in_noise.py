@@ -9,6 +9,8 @@ from ertis_numba.pipeline import verification
 from ertis_numba.pipeline.prediction import relative_to_exact_db
 from tests.simulation.test_data import FOLDER
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 
 @pytest.mark.parametrize(
     ("window_m", "directions"), [((0.5, 0.9), "2d:91"), ((0.5, 1.0), "2d:91"), ((0.5, 1.0), "3d:200")]

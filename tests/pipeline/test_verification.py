@@ -21,6 +21,8 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_recordi
 from tests import reference
 from tests.files import SMALL, noise
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 REFLECTORS = Path(__file__).parents[2] / "data" / "synthetic" / "reflectors.h5"
 FIVE = Processing(directions="2d:5", range_m=(0.4, 1.0))
 CALIBRATED = Array(
