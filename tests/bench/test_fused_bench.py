@@ -42,7 +42,8 @@ MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), AHEAD
 
 
 def test_fused_bench_counts_and_checks_all_pulses(tmp_path, monkeypatch):
-    monkeypatch.setattr(live_fusion, "START_S", 0.5)
+    for name, value in {"START_S": 0.5, "_N_MEASUREMENTS": 2, "_WARM_UP": 3}.items():
+        monkeypatch.setattr(live_fusion, name, value)
     target = tmp_path / "page.md"
     target.write_text(f"<!-- {MARKER} -->\nold\n<!-- /{MARKER} -->\n", "utf-8")
     options = ["--duration", "2", "--json", "--quiet", "--folder", str(tmp_path), "--update", str(target)]
