@@ -19,7 +19,6 @@ from ertis_cli._progress import StatusLine
 from ertis_cli._stop_signals import stopped_by_signals
 
 if TYPE_CHECKING:
-    from types import TracebackType
     from typing import Self
 
     from ertis_cli._supervisor import Life
@@ -137,9 +136,7 @@ class CentralWatch:
             self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: "type[BaseException] | None", error: "BaseException | None", trace: "TracebackType | None"
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._thread is not None:
             self._ended.set()
             self._thread.join()

@@ -4,7 +4,6 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Final, Self, TypeVar
 
 import zmq
@@ -69,9 +68,7 @@ class CentralClient:
         self._context = zmq.Context()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if not self._owner.is_this_process:
             return
         self._closing.set()

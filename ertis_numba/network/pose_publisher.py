@@ -4,7 +4,6 @@ import collections
 import secrets
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -88,9 +87,7 @@ class PosePublisher:
         self._context = zmq.Context()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if not self._owner.is_this_process:
             return
         if self._connection is not None:

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
@@ -148,9 +147,7 @@ class CentralNode:
                 self._poller.register(fd, zmq.POLLIN)
         self._event_reporter.notify("listening", address=self._condition.address, pid=os.getpid())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _note_status(self) -> None:
