@@ -32,10 +32,9 @@ _ENDED = 128  # plus the number of the signal
 class Interruption:
     """Signal handler that ends the command like Ctrl-C, and repeats the signal if a library swallows it.
 
-    Python raises the exception in whatever code runs when a signal arrives. A library's callback, a finaliser, or a
-    bare ``except`` clause may catch it and continue. A thread therefore checks that the main thread is still unwinding,
-    and sends the signal again otherwise. The handler raises nothing in Python's own code for imports, which would keep
-    its locks, so that an import in another thread would wait forever. The signal is sent again a moment later.
+    Python raises the exception in whatever code runs, where a callback, a finaliser or a bare ``except`` may catch it.
+    A thread therefore sends the signal again until the main thread unwinds. It is delayed in Python's own code for
+    imports, which would keep its locks.
     """
 
     def __init__(self) -> None:

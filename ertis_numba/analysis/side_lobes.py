@@ -49,18 +49,11 @@ _QUARTILE_OF_COMPONENT: Final = 0.8134
 class SideLobes:
     """Classifier of the maxima of an image, strongest first: reflectors, or possible side lobes of stronger ones.
 
-    `PointSpread` predicts side lobes for an array as designed and for point reflectors. Real microphones, transducers
-    and surfaces change the pattern of the side lobes, but hardly their mean power. The limit is therefore the sum of
-    the prediction and of a possible deviation. The deviation is a sum of many phasors, so its amplitude is
-    Rayleigh-distributed (J. W. Goodman, Speckle Phenomena in Optics, 2nd edition, chapter 3): in all of N directions,
-    it stays below ``σ √ln(N / p)`` with a probability of 1 - p. σ is measured in the image. It is the deviation from
-    the prediction at the same range, and at most the mean of all side lobes that extend to this range. Echoes that
-    interfere deviate as well. The prediction is therefore first compared with the reflector that fits best: if the
-    pattern around it matches, the array is as designed, and σ is 0. A reflector whose pulse deviates from that of one
-    echo keeps its σ, because the side lobes of several echoes are not predicted.
-
-    Noise adds to side lobes. ``noise`` is the amplitude that it alone reaches with the probability of a false alarm, as
-    `ertis_numba.analysis.noise.threshold_of` returns it. A maximum must exceed the limit by this amplitude, too.
+    `PointSpread` predicts side lobes for an array as designed. The limit adds a possible deviation, a sum of many
+    phasors: in N directions, it stays below ``σ √ln(N / p)`` with a probability of 1 - p (J. W. Goodman, Speckle
+    Phenomena in Optics, 2nd edition, chapter 3). σ is measured at the same range, and is 0 if the pattern around the
+    reflector that fits best matches. A maximum must exceed the limit by ``noise`` as well, the amplitude that noise
+    alone reaches.
     """
 
     def __init__(
@@ -188,10 +181,8 @@ class EdgeFloor:
     """Amplitudes below which maxima near the first or the last range may belong to an echo beyond it.
 
     Side lobes of such an echo extend into the image by `PointSpread.reach_m`, and the skirt of its pulse in all
-    directions. At the range of a reflector, the image consists of its own side lobes, which are much weaker. At the
-    range of side lobes alone, it consists of many maxima of about the same level. A reflector near an edge must
-    therefore exceed the level that its own side lobes would have by comparison with the image, and its pulse must fall
-    towards the edge.
+    directions. A reflector must exceed the level that its own side lobes would have by comparison with the image, and
+    its pulse must fall towards the edge.
     """
 
     def __init__(self, directions: NDArray[np.float64], spread: PointSpread) -> None:

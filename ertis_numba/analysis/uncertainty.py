@@ -51,34 +51,13 @@ class Uncertainty(NamedTuple):
 class PositionUncertainty:
     """Estimator of the errors of points, from noise, from the plan, and from the grid.
 
-    `ertis_numba.analysis.echo_fits.EchoFits` states the errors of fitted echoes: the inverse of the Fisher information
-    of the bins that were fitted. It contains the noise, the remaining errors of the plan, other places that explain the
-    bins nearly as well, and the deviation of the bins from the image of a single echo. With ``noise_only``, errors are
-    the Cramér-Rao bounds of a single echo in white noise
-    ``σ_range = c / (4π β √(2ρ))``, ``σ_across = r / (k √(λ 2ρ))`` and ``σ_level = 1 / √(2ρ)`` nepers,
-    with these quantities:
-
-    - ρ is the power of the point relative to the mean power of the noise.
-    - β is the root-mean-square width of the call's spectrum about its centre (P. M. Woodward, Probability and
-      Information Theory, 1953, for the range ``cτ / 2``), and k is the root mean square of its wave numbers.
-    - λ is the least variance of the microphones' positions along any direction across the line of sight (H. L. Van
-      Trees, Optimum Array Processing, 2002, section 8.4). For an image of one elevation, that direction is the azimuth.
-      Array weights w other than uniform replace the covariance C of the positions by ``C(w) C(w²)⁻¹ C(w)``, where the
-      covariances have the weights in brackets. This expression is the inverse of the covariance of the maximum of a
-      weighted beam, at the same power of noise in the image.
-
-    The images of other points at about the same range disturb a point, like noise of their amplitude there, and so do
-    echoes on the slopes of its pulse: see `listed_echoes`. A deviation of the bins that neither
-    these nor noise explain is a sign of two echoes in one maximum. It adds errors as measured
-    for random pairs of echoes, 6° to 10° apart for an eRTIS: about half of their distance. Pairs whose sum has the
-    shape of one echo are not recognised.
-
-    A direction that was not interpolated, or that ends at the border of its cell, contributes the spacing of the grid.
-    Where the reflector may lie beyond an edge, the direction is unknown, and its standard deviation is 1 rad.
-    A value is infinite if the array cannot resolve that direction. It is NaN for images of the method ``paper``, whose
-    errors by whole samples and plane waves exceed the noise, and if the noise is unknown: for beamformers
-    other than delay-and-sum, whose noise is not Rayleigh-distributed, and if most of the image is 0, as after `clean`.
-    Errors of layout and temperature are not included.
+    `ertis_numba.analysis.echo_fits.EchoFits` states the errors of fitted echoes, see docs/explanation/accuracy.md. With
+    ``noise_only``, errors are the Cramér-Rao bounds of a single echo in white noise, ``σ_range = c / (4π β √(2ρ))``,
+    ``σ_across = r / (k √(λ 2ρ))`` and ``σ_level = 1 / √(2ρ)`` nepers. ρ is the power of the point relative to the
+    noise, β the RMS width of the call's spectrum, k the RMS wave number, and λ the least variance of the microphones'
+    positions across the line of sight, of ``C(w) C(w²)⁻¹ C(w)`` with array weights w (P. M. Woodward, 1953; H. L. Van
+    Trees, Optimum Array Processing, 2002, section 8.4). A value is infinite if the array cannot resolve that direction,
+    and NaN if the noise is unknown or the method is ``paper``.
     """
 
     def __init__(self, settings: Settings, *, is_planar: bool, noise_only: bool = False) -> None:

@@ -40,13 +40,9 @@ class SoundArrival:
 
 
 def measure_arrival(pulses: Compressed, call: Call, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> SoundArrival:
-    """Measure the sound around times that are known to a few microseconds, by maximum likelihood.
-
-    All microphones receive the same unknown pulse R with real amplitudes a and delays d, in white noise of the same
-    power: ``Y(f) = a R(f) exp(−2πj f d) + N(f)``. The standard deviations are the Cramér-Rao bounds for a known pulse,
-    ``σ_d = σ / (2π a √(2 Σ f² |R|²))`` and ``σ_a = σ / √(2 Σ |R|²)`` (S. M. Kay, Fundamentals of Statistical Signal
-    Processing: Estimation Theory, 1993, sections 3.11 and 7.9). The used microphones determine the common pulse.
-    """
+    """Measure the sound around times that are known to a few microseconds, by maximum likelihood."""
+    # With `Y(f) = a R(f) exp(−2πj f d) + N(f)` for a common pulse R, standard deviations are the Cramér-Rao bounds `σ_d
+    # = σ / (2π a √(2 Σ f² |R|²))` and `σ_a = σ / √(2 Σ |R|²)` (S. M. Kay, Estimation Theory, 1993).
     bins, frequency_hz = _whitened(pulses, call, at_s)
     made = _estimate(bins, frequency_hz, used)
     # Half a period of delay resembles an inversion, so a microphone is inverted only on strong evidence.

@@ -40,11 +40,8 @@ def calibrate_poses(
 ) -> PoseCalibration:
     """Estimate poses of sensors from reflectors that they hear in common, and from each other's calls.
 
-    All sensors emit together on one SYNC chain, in the order of `measurements`. Record 10 to 20 measurements with one
-    small reflector at different places, 0.5 to 2 m away. Not every sensor must hear each place: front and back may be
-    linked by a third sensor. An error of the speed of sound scales all distances: 1 °C changes them by 0.17 %. In
-    simulations, balls with a radius of 4 cm, taken for points, cause errors of 4 mm and 0.4°. Calibrate arrays first:
-    wrong delays of microphones turn directions.
+    All sensors emit together on one SYNC chain, in the order of `measurements`; docs/how-to/calibrate.md describes the
+    recordings. An error of the speed of sound scales all distances: 1 °C by 0.17 %. Calibrate arrays first.
     """
     if len(measurements) < 2:
         raise ArgumentError(

@@ -27,10 +27,8 @@ class Solution(NamedTuple):
 class SeparableProblem:
     """Residuals and Jacobian as functions of the sources alone.
 
-    For given sources, delay and position of each microphone follow from its own times by linear least squares, because
-    travel times are almost linear in its position. The remaining problem has three unknowns per recording (variable
-    projection: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10, 1973). Its Jacobian omits the derivative of the
-    projection, as L. Kaufman, BIT 15, 1975, proposes.
+    Delay and position of each microphone follow from the sources by linear least squares: variable projection (G. H.
+    Golub and V. Pereyra, 1973). The Jacobian omits the derivative of the projection (L. Kaufman, 1975).
     """
 
     def __init__(

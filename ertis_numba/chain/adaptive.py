@@ -18,10 +18,9 @@ _NEGLIGIBLE = 0.01  # share of the budget
 class AdaptiveBeamform:
     """Adaptive beamformer: amplitude of every direction and range; implements `Beamform`, and is thread-safe.
 
-    An echo that reaches all microphones alike has the same level as with delay-and-sum. ``offsets`` (direction, mic)
-    index each microphone's first sample in a flattened (mic, phase, sample); ``weights`` (direction, mic) are the phase
-    of the carrier and the calibration, with magnitudes that add up to about 1. ``budget`` is the permitted error power;
-    0 requires the highest precision of the kernel.
+    ``offsets`` (direction, mic) index each microphone's first sample in a flattened (mic, phase, sample); ``weights``
+    (direction, mic) are the phase of the carrier and the calibration. ``budget`` is the permitted error power; 0
+    requires the highest precision.
     """
 
     def __init__(

@@ -1,13 +1,7 @@
 """Beam grid: interpolation of all beams from beams at a few grid points.
 
-The aperture limits the rate at which a beam changes with its direction: the outermost microphones turn their phase
-fastest. Beams at the points of a grid are therefore sufficient if the grid is slightly finer than the resolution of
-the aperture. Any other beam is a weighted sum of the beams around it, with the weights of `interpolation_fit`. With 32
-microphones and 3000 directions, there are ten times fewer grid points than directions. The weighted sum then has 16
-real terms, instead of 32 or more complex terms for a separate beam.
-
-The grid lies in the axes of the array: a line array needs one axis, a plane array two. A grid point is a point of that
-plane, not of the sphere. Points outside the unit circle correspond to no direction but serve interpolation equally.
+A beam is a weighted sum of beams at the points of a grid, slightly finer than the resolution of the aperture; see
+docs/explanation/accuracy.md. Points lie in the plane of the array, also beyond the unit circle.
 """
 
 import copy

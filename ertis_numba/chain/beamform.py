@@ -174,12 +174,9 @@ class _WholeZone:
 
 
 class BeamformInt16:
-    """Delay-and-sum beamformer on 16-bit samples, scaled for each tile of ranges; implements `Beamform`.
+    """Delay-and-sum beamformer on 16-bit samples, scaled for each tile of ranges; implements `Beamform`."""
 
-    The 32-bit sums must hold all terms at full scale. For weights w and samples of magnitudes up to x, the condition is
-    ``x · Σ|w| ≤ 2³¹``. Of the bits available to one product, weights get 12, or half if there are fewer than 24. Beams
-    at beam-grid points keep the upper 16 bits of their sums, so a sum that fills 32 bits fills these 16 bits as well.
-    """
+    # Weights get 12 bits of a product, or half if there are fewer than 24, so that `x · Σ|w| ≤ 2³¹`.
 
     def __init__(
         self,

@@ -1,19 +1,7 @@
 """Error model: the image error that each step of a plan causes, predicted before processing.
 
-The error is ``‖image − exact‖ / ‖exact‖`` over all directions and ranges, in decibels. The exact image is that of
-`tests/reference.py`: float64, no decimation, delays as exact phase shifts.
-
-Most steps cause errors of complex beams. These errors add up like noise, both between microphones and between steps,
-because `interpolation_fit` leaves hardly any error that microphones share. Let ε be the error power of a step, relative
-to the power of a microphone's signal after the matched filter. Let ``gain`` be the mean power of the image, relative to
-the image of uncorrelated microphones. The step then contributes the error power
-
-    s ε / gain ,   s = ½ for gain ≤ 1,   s = 1 − ½ / gain beyond.
-
-s is the share of a complex error that changes a magnitude. In noise it is one half: the other half turns the phase,
-which the envelope does not contain. s is larger if a few coherent echoes dominate the image: beam and error are then
-sums of the same waves and tend to have the same phase. The gain of coherent echoes does not follow from the settings.
-A `SignalModel` measures it; without a measurement, the model assumes safe values.
+Each step adds ``s ε / gain`` to the error power, where s is the share of a complex error that changes a magnitude: ½
+for gain ≤ 1, and 1 − ½ / gain beyond. docs/explanation/accuracy.md has the equations.
 """
 
 import math
@@ -130,13 +118,8 @@ class ErrorModel:
         fractions: NDArray[np.float64] | None = None,
         passed: NDArray[np.float64] | None = None,
     ) -> float:
-        """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum.
-
-        The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. The
-        rest differs between microphones; among few, in effect ``n_mics``, it averages out less. ``fractions`` (delay,)
-        are in steps, if too few to spread evenly; ``passed`` (wave,) is the share that remains after beam
-        interpolation.
-        """
+        """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum."""
+        # The mean error over all delays acts as a filter; the rest averages out less among few microphones, `n_mics`.
         signal_model = self.signal_model
         if fractions is not None:
             return (
@@ -185,12 +168,7 @@ class ErrorModel:
         return _UNLIKE * float(wrong.sum() / beams.sum())
 
     def zones(self, aperture: Aperture, curvature_2: float, *, sound_speed_m_s: float) -> float:
-        """Return the error power of focal zones whose curvatures deviate by this mean square, in 1/m².
-
-        A wavefront of curvature b = 1/r reaches a microphone at p with the extra delay ``b (p² − (u·p)²) / 2c``. The
-        mean extra delay of all microphones turns the phase of the beam and shifts its envelope. Only the phase at the
-        mean frequency has no effect on the image.
-        """
+        """Return the error power of focal zones whose curvatures deviate by this mean square, in 1/m²."""
         along_m = aperture.directions @ aperture.positions_m.T
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
         weights, power = self._weights, self._weights**2 / np.mean(self._weights**2)
@@ -208,12 +186,7 @@ class ErrorModel:
         return min(1.0, self.zones(aperture, max(range_m, NEAREST_M) ** -2, sound_speed_m_s=sound_speed_m_s))
 
     def samples(self, *, n_terms: int, terms: float, limit: float, weight_limit: float, taps: float) -> float:
-        """Return the error power of rounding real and imaginary parts of samples and weights by up to half a step.
-
-        The step of samples is the largest magnitude in the tile, divided by ``limit``; that of weights is the largest
-        one, divided by ``weight_limit``. ``terms`` and ``taps`` are the sums of squared weights of a microphone's
-        terms, and of a beam's grid points; both are 1 without interpolation.
-        """
+        """Return the error power of rounding real and imaginary parts of samples and weights by up to half a step."""
         of_samples = terms * self.signal_model.crest / limit**2 / 6
         of_weights = n_terms / weight_limit**2 / 6
         return self._of(taps * (of_samples + of_weights))
@@ -221,8 +194,7 @@ class ErrorModel:
     def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float, filled: float) -> float:
         """Return the error power of rounding beams at grid points to 16 bits, steps of 2⁻¹⁵ of all terms at full scale.
 
-        ``sum_of_terms`` is the sum of the magnitudes of a microphone's weights, ``filled`` that of all terms at full
-        scale relative to 2³¹, and ``taps`` is as in `samples`.
+        ``sum_of_terms`` is the sum of the magnitudes of a microphone's weights, and ``filled`` that of all terms / 2³¹.
         """
         step_2 = self.signal_model.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
         return self._of(taps * step_2 / 6)
@@ -241,9 +213,7 @@ class ErrorModel:
     def window(self, taps: NDArray[np.int16] | NDArray[np.int32], *, guard_s: float, imaged_s: float) -> float:
         """Return the error power of ringing beyond a time window: it is cut off at each end, and as much wraps around.
 
-        The matched filter h rings before and after the call. At the first and the last range, the window lacks the
-        samples that h beyond ``guard_s`` weights. Further inside it lacks less: the power of the cut, which extends
-        beyond the band and lets noise through, falls with the sixth power of the time.
+        The cut of the ringing falls with the sixth power of the time inside the window.
         """
         settings, model = self._settings, self.signal_model
         rate_hz, call_s = settings.signal_rate_hz, settings.call.end_s

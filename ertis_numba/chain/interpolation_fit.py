@@ -1,18 +1,7 @@
 """Least-squares interpolation of delays and beams.
 
-A sample between stored samples and a beam between computed beams are both weighted sums of their neighbours. For a
-plane wave of unit amplitude, the neighbours are ``E[wave, tap]`` and the targets are ``T[wave, target]``. The free
-parameters are the weights ``c[tap, target]`` and a gain ``g[wave]`` that all targets share; the matched filter applies
-the gain at no cost. The fit minimises
-
-    Σ_wave power[wave] · Σ_target |T − g (E c)|²
-
-over weights and gain. The problem is linear in either, and the fit alternates between them. The gain removes the error
-that all targets share. The remaining error therefore has zero mean over the targets and adds up between microphones
-like noise. Its power is a tight estimate of the image error, not only a bound. The gain corresponds to the
-deapodization of gridding (J. I. Jackson et al., Selection of a convolution function for Fourier inversion using
-gridding, IEEE Trans. Med. Imaging 10, 1991; J. A. Fessler and B. P. Sutton, Nonuniform fast Fourier transforms using
-min-max interpolation, IEEE Trans. Signal Process. 51, 2003).
+Weights ``c[tap, target]`` and a gain ``g[wave]`` that all targets share minimise ``Σ_wave power · Σ_target |T − g (E
+c)|²`` in turns, as in gridding (J. A. Fessler and B. P. Sutton, 2003). docs/explanation/accuracy.md explains it.
 """
 
 import functools

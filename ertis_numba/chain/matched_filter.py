@@ -21,10 +21,8 @@ Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
 class MatchedFilter:
     """Matched filter that returns analytic signals, (mic, phase, sample), at the output rate in several phases.
 
-    A beam is needed only at the output ranges, but its delays are much finer than their spacing. One inverse transform
-    per phase therefore computes the samples: those of phase p lie ``p / n_phases`` of a step after those of phase 0.
-    The filter also divides by the gain of the decimation filter ``taps``, which is known exactly within the band, and
-    applies ``gain``, a function of frequencies (bin,) in Hz that returns (mic, bin) or (1, bin) complex128.
+    The samples of phase p lie ``p / n_phases`` of a step after those of phase 0. The filter divides by the gain of the
+    decimation filter ``taps``, and applies ``gain``, a function of frequencies (bin,) in Hz.
     """
 
     def __init__(

@@ -197,9 +197,7 @@ def _filtered_call(settings: Settings, demodulate: _Demodulate) -> NDArray[np.fl
 class _LowPass:
     """Low-pass filter of rectified beams, decimated by ``output_decimation``; its ``delay`` in samples is compensated.
 
-    The paper states neither order nor bandwidth. This is a Butterworth filter of the same order as the others. Its
-    cutoff is half the output rate, or the call's lowest frequency if that is lower. It removes the ripple at twice the
-    carrier and keeps the range resolution that the output rate allows.
+    The paper states neither order nor bandwidth; the cutoff removes the ripple at twice the carrier.
     """
 
     def __init__(self, settings: Settings) -> None:

@@ -1,24 +1,8 @@
 """Streams of a plan: the delay-and-sums from which an adaptive beamformer is computed, and the errors of each.
 
-DMAS of order n is the elementary symmetric polynomial e_n of the roots ``z = y |y|^(1/n − 1)`` of M microphones. By
-Newton's identities it follows from the power sums ``p_k = Σ z^k``, each a delay-and-sum of a stream ``z^k``. With
-``∂e_n / ∂p_k = ± e_(n−k) / k``, an error power ε of each ``z^k``, relative to its power, changes the image by
-
-    M / k² · C(M, n−k) / C(M, n) · ε          for microphones with independent signals,
-    M / k² · (C(M, n−k) / C(M, n))² · ε       for an echo that reaches all microphones alike.
-
-An error that all microphones share adds up to M² instead of M. With 32 microphones, higher power sums therefore need
-little accuracy, and those of the highest orders can be left out. The coherence factor follows from the sums of y and
-|y|². Each stream gets the fewest taps and the cheapest beam grid whose error is not above that of the first stream.
-
-Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are less affected: they are bright
-where signals are strong. Their errors come from the spectrum there, or from one echo, whose envelope has zeros in all
-microphones, if that error is larger. The planner assumes echoes in noise. The noise has nine tenths of the power in the
-image of delay-and-sum, and much less in the images here. Images of noise only, or of echoes that overlap everywhere,
-may have larger errors.
-
-The matched filter can apply the gains of delay and beam interpolation to a stream of the signals themselves, see
-`interpolation_fit`. Other streams are nonlinear, so the signals for them have no gain.
+docs/explanation/accuracy.md has the errors of DMAS by Newton's identities. Each stream gets the fewest taps and the
+cheapest beam grid whose error is not above that of the first stream. Only the stream of the signals themselves may have
+gains, see `interpolation_fit`.
 """
 
 import functools

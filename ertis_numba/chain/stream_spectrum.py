@@ -32,14 +32,8 @@ class StreamSpectrum(NamedTuple):
 
 @functools.lru_cache(maxsize=_KEPT)
 def spectrum_of_stream(spectrum: Spectrum, stream: SignalStream) -> StreamSpectrum:
-    """Return the spectra of a stream of signals with a given spectrum.
-
-    Errors of ``|y|^a exp(ikφ)`` matter where y is strong. Weighted by ``|y|^(2 − 2a)``, the power of its derivative is
-    that of ``|y|² (a² (ln |y|)'² + k² φ'²)``. Both terms of ``|y'|² = |y|² ((ln |y|)'² + φ'²)`` are equal on average.
-    The bandwidth is therefore that of y times ``√((a² + k²) / 2)``, and the spectrum of y is stretched by this factor.
-    The whole spectrum has no closed form for all powers, so it is estimated from noise of a fixed seed. It has wide
-    tails, because phases jump at zeros of the noise, and magnitudes to a power below 1 have a cusp there.
-    """
+    """Return the spectra of a stream of signals with a given spectrum."""
+    # Weighted by brightness, a stream has the bandwidth of the signals times `√((a² + k²) / 2)`.
     if stream.power == 1 and stream.turns == 1:
         return StreamSpectrum(spectrum, spectrum)
     stretch = math.sqrt((stream.power**2 + stream.turns**2) / 2)
@@ -57,13 +51,8 @@ def highest_hz(low_hz: float, high_hz: float, stream: SignalStream) -> float:
 
 @functools.lru_cache(maxsize=_KEPT_FITS)
 def pulse_errors(fit: DelayFit, spectrum: Spectrum, stream: SignalStream) -> tuple[float, float]:
-    """Return the error powers of a stream's delays for one echo that reaches all microphones alike.
-
-    The signal y of an echo has the spectrum of the matched filter's output. Its envelope has zeros, where streams
-    change suddenly. An error of ``|y|^a exp(ikφ)`` changes the image by its product with ``|y|^(1 − a)``, but by
-    at most y for a > 1, because factors are limited. The result has the part that differs between microphones, and the
-    part that they share, relative to the power of y.
-    """
+    """Return the error powers of a stream's delays for one echo that reaches all microphones alike."""
+    # The envelope of an echo has zeros, where streams change suddenly. The second result is the error that all share.
     frequency_hz, power = spectrum.frequency_hz, spectrum.power
     width_hz = float(frequency_hz[-1] - frequency_hz[0]) + 1.0
     time_s = np.arange(-_PULSE_WIDTHS * _PULSE_DENSITY, _PULSE_WIDTHS * _PULSE_DENSITY) / (_PULSE_DENSITY * width_hz)

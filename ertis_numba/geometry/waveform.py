@@ -142,13 +142,9 @@ def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
 
 
 def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilterSpectrum:
-    """Return the read-only matched filter, with own filters, for spectra of decimated signals.
-
-    ``H(f) = g conj(S(f)) W(f) F(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
-    window that is 1 over the call's band and falls to 0 outside it as a raised cosine, F the gain of own filters, and g
-    such that the call itself gives an envelope of 1, unless F distorts phases: ``g Σ |S|² W |F| = n_fft``. The length
-    ``n_fft`` is even or odd, and at least that of the call.
-    """
+    """Return the read-only matched filter, with own filters, for spectra of decimated signals."""
+    # docs/explanation/accuracy.md defines it. The call itself gives an envelope of 1, unless own filters distort
+    # phases.
     decimation = settings.decimation if decimation is None else decimation
     band_hz = matched_band_hz(settings)
     rate_hz = settings.recording.sample_rate_hz

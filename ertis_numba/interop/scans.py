@@ -23,14 +23,9 @@ _HALF_POWER: Final = 0.44  # Half of the main lobe of an array of length 1, at h
 def scan_message(
     image: Energyscape, *, min_level_db: float = -20.0, floor_dbfs: float = -math.inf
 ) -> dict[str, Any] | None:
-    """Return the nearest echo of each azimuth, as LaserScan, intensities in dBFS; None if not planar.
-
-    The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
-    scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
-    sensors. A reflector fills the beam nearest to it, and all beams within one standard deviation of its direction. In
-    other beams within half of the main lobe of the array, 3.5° for eRTIS at 25 to 50 kHz, the range beyond it is
-    infinite, because farther echoes may be those of sound that it reflected to another surface.
-    """
+    """Return the nearest echo of each azimuth, as LaserScan, intensities in dBFS; None if not planar."""
+    # A reflector fills the beam nearest to it, and all within one standard deviation of its direction. In other beams
+    # within half of the main lobe, the range is infinite: farther echoes may be those of sound that it reflected.
     if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
         return None
     azimuth_rad = unrolled_rad(image.azimuth_rad)

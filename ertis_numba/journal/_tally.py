@@ -1,8 +1,7 @@
 """Highest numbers that a journal contains, stored in a file beside it.
 
-A damaged log can lose measurements without an error from SQLite, and the tally reveals such losses. It is written
-after each commit, without a sync. It never lists a number that was not stored. If the process is killed, the tally is
-still complete.
+A damaged log can lose measurements without an error from SQLite. The tally is written after each commit, without a
+sync, and never lists a number that was not stored.
 """
 
 import json

@@ -57,11 +57,9 @@ class _Received:
 class PulseReceiver:
     """Receiver that groups the images of a central node by SYNC pulse, in a thread.
 
-    A pulse is complete when all sensors of the two pulses before have sent their image, when three later pulses have
-    begun, or when no image has come for 0.25 s. A slow application gets the latest pulses. A sensor without a mounting,
-    in ``mountings`` or from the central node, and one that sends NaN, is left out with a note. A thread calls
-    ``on_note`` for each change of the connection. As many threads as there are cores call ``on_image`` for
-    images as they arrive, unless a pulse waits for `receive`.
+    A pulse is complete with all sensors of the two pulses before, after three later pulses, or after 0.25 s without an
+    image. Sensors without a mounting, and those that send NaN, are left out with a note. As many threads as there are
+    cores call ``on_image``, unless a pulse waits for `receive`.
     """
 
     def __init__(

@@ -1,8 +1,7 @@
 """ZAP authenticator: checks the keys of connections, and attributes messages to keys.
 
-ZeroMQ asks a handler over ZAP (RFC 27) about each new key. Without a handler, CURVE accepts any key; a dead handler
-blocks all keys, or none. This handler runs in the event loop of the sockets, so it lives as long as they do. Any error
-inside it refuses the key.
+ZeroMQ asks a handler over ZAP (RFC 27) about each new key; without one, CURVE accepts any key. This one runs in the
+event loop of the sockets, and any error inside it refuses the key.
 """
 
 import secrets
@@ -42,10 +41,8 @@ _AUTH: Final = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 class ZapAuthenticator:
     """Handler that accepts listed keys and identifies the sender of a message.
 
-    Make it before any server, `watch` each server to count connections without a key, and call `self_test`. In the
-    loop, call `serve` when ``socket`` is readable, `tick` several times a second, and `who` for each message. Without
-    ``keys``, every peer has all permissions. ``refused`` counts connections by reason, to which callers add messages.
-    ``note`` is the error of the allow list, which keeps all nodes out.
+    Make it before any server, `watch` each server, and call `self_test`; then `serve`, `tick` and `who`. Without
+    ``keys``, every peer has all permissions. ``note`` is the error of the allow list, which keeps all nodes out.
     """
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: ServerKeys | None) -> None:

@@ -20,19 +20,10 @@ LAGS: Final = 4
 
 
 def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: ScanExtent) -> float:
-    """Return the probability that noise alone gives the beam of any direction at least a share of all power.
-
-    In white noise of unknown power, the share R of one direction in the power of D dimensions (microphones minus other
-    sources) has the Beta distribution ``R ~ Beta(K, K (D − 1))`` for K independent complex samples. For many
-    dimensions, this is nearly a Gamma distribution. The expected Euler characteristic of the directions of a connected
-    set that exceed R is ``E = P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)`` (K. J. Worsley, Local
-    maxima and the expected Euler characteristic of excursion sets of χ², F and t fields, 1994). Here g is the density
-    of ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the set in units of the
-    array's resolution: see `ScanMesh.extent`. At high levels, this is the expected number of places that exceed R.
-    These are rare and independent in cells as large as the distance π/2 of orthogonal waves (D. J. Aldous, Probability
-    approximations via the Poisson clumping heuristic, 1989). With N cells, the probability of at least one place is
-    therefore ``1 − (1 − E / N)^N``. It is 1 if the share is not above its mean.
-    """
+    """Return the probability that noise alone gives the beam of any direction at least a share of all power."""
+    # With `n = 2K (D − 1)`, the expected number of places is `E = P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)` for the density
+    # g of `φ = arccos √R` (K. J. Worsley, 1994), and `1 − (1 − E / N)^N` for N independent cells. See
+    # docs/explanation/acoustic-maps.md.
     if n_dimensions < 2 or share <= 1 / n_dimensions:
         return 1.0
     if share >= 1:
@@ -50,12 +41,8 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
 
 
 def chance_of_phases(share: float, *, n_bins: float, n_mics: int, extent: ScanExtent) -> float:
-    """Return the probability that random phases of the microphones give a direction at least a share of their power.
-
-    The share of a direction whose phases differ by δ is about ``exp(−Σ |δ|² / M)`` with M microphones. Such phases fill
-    a tube around those of all directions, whose volume is that of ``extent`` times a ball, relative to the torus of all
-    phases (H. Weyl, On the volume of tubes, 1939). Further independent bins have the same direction.
-    """
+    """Return the probability that random phases of the microphones give a direction at least a share of their power."""
+    # Phases that differ by δ have a share of `exp(−Σ |δ|² / M)`, and fill a tube around all directions (H. Weyl, 1939).
     n, radius = n_mics - 1, math.sqrt(-n_mics * math.log(min(max(share, 1e-12), 1.0)))
     cell = math.sqrt(n_mics) / (2 * math.pi) ** n
 
@@ -71,12 +58,9 @@ def chance_of_phases(share: float, *, n_bins: float, n_mics: int, extent: ScanEx
 def independent_samples(
     shares: NDArray[np.floating], n_blocks: int, similarity: NDArray[np.floating] | None = None
 ) -> float:
-    """Return the number of independent samples whose mean power varies as that of bins of blocks.
-
-    Hann windows that overlap by half leave 0.47 independent samples of each bin and block: neighbouring bins and blocks
-    are correlated (P. D. Welch, 1967). ``similarity``, (LAGS + 1,), is the squared cosine of the angle between the
-    beams of two bins, from 0 bins apart on, which reduces their correlation; 1 by default, as for a microphone.
-    """
+    """Return the number of independent samples whose mean power varies as that of bins of blocks."""
+    # Hann windows that overlap by half leave 0.47 samples of each bin and block. `similarity` (LAGS + 1,) is that of
+    # beams.
     same, next_one = _correlations()
     products = np.correlate(shares, shares, "full")[len(shares) - 1 :][: LAGS + 1].astype(np.float64)
     products[1:] *= 2

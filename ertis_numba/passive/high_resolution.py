@@ -32,18 +32,8 @@ class _Found(NamedTuple):
 class HighResolutionClean:
     """Search for the components of sources in matrices (bin, mic, mic) by markers beside their peaks.
 
-    This is HR-CLEAN-SC (P. Sijtsma, R. Merino-Martinez, A. Malgoezar and M. Snellen, High-resolution CLEAN-SC: Theory
-    and experimental validation, 2017). The component of a source is the sound coherent with its marker u, a direction
-    within the main lobe. Among the directions with ``|v^H u|² ≥ M² / 4``, the marker minimises the share of the other
-    sources in this sound,
-
-    ``F(u) = |Σ_k p_k (v_k^H u) v_k|² / |v^H u|²``,
-
-    where v is the wave of the source, and p_k and v_k are the powers and waves of the others. The source moves to the
-    maximum of its component's map. The component is subtracted before those of weaker sources are computed. Sources are
-    added one by one: each at the peak of the map without all components, after which all markers are chosen again. The
-    paper starts with all sources at once, and with equal weights, which requires their exact number. If ``hollow``, the
-    diagonal of the matrices is left out.
+    docs/explanation/acoustic-maps.md has the steps (P. Sijtsma et al., 2017). Sources are added one by one, which needs
+    no exact number of them. If ``hollow``, the diagonal of the matrices is left out.
     """
 
     def __init__(self, matrices: NDArray[np.complexfloating], waves: Waves, *, hollow: bool) -> None:

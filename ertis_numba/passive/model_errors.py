@@ -28,14 +28,9 @@ _MARGIN: Final = 2.0  # Largest power of errors relative to that expected.
 def beside_sources(
     likelihood: BandLikelihood, places: Floats, omegas: Floats, band: HeardBand, omega: Floats
 ) -> tuple[BandLikelihood, float]:
-    """Return the likelihood of further sources, and the largest power of errors in a beam relative to that of noise.
-
-    The frequencies of a source within a bin differ, or blocks of distant microphones hear different parts of its sound.
-    Its waves then lie in the space of the wave and of its derivatives by frequency. So do waves from a range of 1 m on,
-    if plane ones are expected, with derivatives by 1/range. Derivatives that stand out of the
-    noise are left out like the wave, as long as two thirds of the dimensions remain. Those with more power than is
-    expected are kept: it may be that of a further source close by.
-    """
+    """Return the likelihood of further sources, and the largest power of errors in a beam relative to that of noise."""
+    # Waves of a source whose frequency varies, or from a range of 1 m on, lie in the space of the wave and its
+    # derivatives. Derivatives that stand out of the noise are left out, as long as two thirds of the dimensions remain.
     orders = np.zeros((len(places), 2), np.intp)
     if not len(places):
         return likelihood.beside(places, omegas, omega), 0.0

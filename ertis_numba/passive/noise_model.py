@@ -26,10 +26,7 @@ _RESPONSE_POINTS: Final = 56  # An even number: the response at one bin is the l
 class NoiseModel:
     """Mixture of white noise of the microphones and of a diffuse field of sound.
 
-    The coherence of a diffuse field between microphones at a distance d is ``sin(k d) / (k d)`` (R. K. Cook et al.,
-    Measurement of correlation coefficients in reverberant sound fields, 1955). A bin measures its mean over the
-    frequency response of the Hann window, which is smaller: the blocks of distant microphones hear different parts of
-    the sound.
+    Its coherence is ``sin(k d) / (k d)`` (R. K. Cook et al., 1955), averaged over the response of the Hann window.
     """
 
     def __init__(

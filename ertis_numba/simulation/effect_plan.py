@@ -74,18 +74,9 @@ class EffectPlan:
 
 
 def make_plan(scene: Scene) -> EffectPlan:
-    """Decide for each effect whether it changes any image by more than the scene's tolerance.
-
-    Effects that a key of the scene requests are on, see `effects.ASKED_FOR`. With a tolerance of 0, all that apply are
-    on. The others are estimated for all sensors at the beginning, at the end, in between and at waypoints. The greatest
-    change counts. Effects are estimated one after the other, each given those before it: geometry first, then filters
-    of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes. An effect
-    that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
-
-    If an estimate is not certain enough, A/B renders measure the change in the measurements with the greatest
-    estimates, and in the loudest one, because estimates do not model converters. Raise ArgumentError if a surface
-    touches or encloses a microphone or an emitter, or the scene exceeds a limit.
-    """
+    """Decide for each effect whether it changes any image by more than the scene's tolerance."""
+    # docs/explanation/simulator.md describes the choice. Raise ArgumentError if a surface touches or encloses a
+    # microphone or an emitter, or the scene exceeds a limit.
     indices = _indices(scene)
     cache = Cache()
     shots = [

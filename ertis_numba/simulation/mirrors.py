@@ -72,12 +72,9 @@ Views = tuple[Seen[Transmitters], Seen[Receivers], Seen[Transmitters]]
 
 
 def images(end: End, places_m: Floats, mirrors: Mirrors, largest: int) -> Seen[End]:
-    """Return the ways to an end and to its images of up to ``largest`` reflections that are visible from some place.
-
-    The image of an image is ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for efficiently
-    simulating small-room acoustics, JASA 65, 1979). It is valid where every mirror point lies within its wall (J.
-    Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984).
-    """
+    """Return the ways to an end and to its images of up to ``largest`` reflections that are visible from some place."""
+    # They are visible where every mirror point lies within its wall (J. B. Allen, D. A. Berkley, 1979; J. Borish,
+    # 1984).
     n_places = len(places_m)
     require_few_mirrors(len(mirrors), largest, n_places)
     straight = np.stack([np.broadcast_to(end.centre_m, places_m.shape), places_m])

@@ -69,12 +69,8 @@ def _mics_of_bits(layout: Layout) -> NDArray[np.int32]:
 
 
 def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the numerator and the denominator of the noise transfer function, in powers of 1/z.
-
-    The poles are those of a Butterworth high pass with all zeros at 0 Hz and a gain of 1.5 at half of the sample rate.
-    The zeros then move to the roots of the Legendre polynomial on the band. This minimises the noise in the
-    band (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters, IEEE Press 2005, chapter 4).
-    """
+    """Return the numerator and the denominator of the noise transfer function, in powers of 1/z."""
+    # It is a Butterworth high pass with zeros at the roots of the Legendre polynomial (R. Schreier, G. C. Temes, 2005).
     checks.integer("order", order, 1, _MAX_ORDER)
     checks.between("band", band, 0.0, 0.25)
     angle = math.pi * (2 * np.arange(order) + order + 1) / (2 * order)
@@ -90,14 +86,8 @@ def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArra
 
 @functools.cache
 def loop_gains(order: int, band: float) -> tuple[float, float, float, float, float, float]:
-    """Return the gains c1 to c4, r1 and r2 of `modulate_pdm` for a noise transfer function.
-
-    The loop is a cascade of integrators with local resonators (r). The quantiser receives all integrator outputs and
-    the input. The signal therefore passes without gain or delay, and the integrators carry only shaped noise
-    (J. Silva, U. Moon, J. Steensgaard, G. C. Temes, Wideband low-distortion delta-sigma ADC topology, Electronics
-    Letters 37, 2001). The feed-forward weights follow from the first samples of the loop filter's impulse response,
-    ``1/NTF − 1``. Integrators are scaled by their weights, so that the quantiser receives their plain sum.
-    """
+    """Return the gains c1 to c4, r1 and r2 of `modulate_pdm` for a noise transfer function."""
+    # The quantiser receives the input and all integrators, scaled by their weights (J. Silva et al., 2001).
     zeros, poles = noise_transfer(order, band)
     loop = np.zeros(order + 1)  # impulse response of poles / zeros
     for n in range(order + 1):

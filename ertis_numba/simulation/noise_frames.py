@@ -70,12 +70,8 @@ def spectrum_of(noise: Noise) -> tuple[Floats, Floats]:
 
 @functools.lru_cache(maxsize=4)
 def _interpolator(frame: NoiseFrame) -> scipy.interpolate.CubicSpline:
-    """Return the windowed noise ``w(t) Re Σ A exp(2πi f t)`` as a spline that is NaN outside the frame.
-
-    The amplitudes are complex Gaussian numbers with a mean square of twice the power at each frequency. The window
-    ``sin(π/2 sin²(πt/T))`` preserves the power, and has lower side lobes than a half sine (Vorbis I specification,
-    section 1.3.2).
-    """
+    """Return the windowed noise ``w(t) Re Σ A exp(2πi f t)`` as a spline that is NaN outside the frame."""
+    # The window `sin(π/2 sin²(πt/T))` preserves the power, and has lower side lobes than a half sine (Vorbis I).
     frequency_hz, power = spectrum_of(frame.noise)
     bins = np.rint(frequency_hz * FRAME_S).astype(int)
     n_samples = 1 << math.ceil(math.log2(_OVERSAMPLING * (bins[-1] + 1)))

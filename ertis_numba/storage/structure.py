@@ -1,8 +1,7 @@
 """Bounded access to HDF5 files from untrusted sources.
 
-HDF5 files can point into other files, declare billions of rows without storing them, and contain the same rows under
-many names. Files of this package do none of that. A reader therefore compares the declared sizes with the stored data
-before it reads any of them, so that the size of the file limits time and memory.
+HDF5 files can point into other files, and declare rows without storing them. A reader therefore compares declared sizes
+with the stored data, so that the size of the file limits time and memory.
 """
 
 import math

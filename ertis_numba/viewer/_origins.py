@@ -31,13 +31,9 @@ def is_loopback(host: str) -> bool:
 
 @contextlib.contextmanager
 def own_pages(host: str, token: str | None = None) -> Iterator[None]:
-    """Make a server created in this block refuse pages of other sites, which a browser lets connect to any host.
-
-    With a token, it also refuses browsers that have never opened an address with ``?token=``. A cookie keeps the token.
-    A browser sends the site of a page (Origin, RFC 6454) and the server that it connects to (Host). For a page from
-    here, both are the same. On loopback, the host must also be a loopback name, because another site may resolve its
-    own name to this machine. viser accepts all of them, and has no option.
-    """
+    """Make a server created in this block refuse pages of other sites, which a browser lets connect to any host."""
+    # A page from here has the same site (Origin, RFC 6454) and server (Host), on loopback by a loopback name. With a
+    # token, it also refuses browsers without `?token=` or its cookie. viser accepts all of them, and has no option.
     serve = websockets.asyncio.server.serve
     local = is_loopback(host)
 

@@ -1,12 +1,8 @@
 # mypy: ignore-errors
 """Combine the microphones with minimum-variance weights, from covariances over a window of ranges.
 
-A window of K ranges has a covariance of rank K, so its loaded inverse needs only a K × K system. Let Y, (mic, K), be
-the window's samples, ``s = Yᴴ 1`` their beams, and ``D = Yᴴ Y − s sᴴ / M`` the products of the microphones' deviations
-from their mean. The solution t of ``(ε I + D) t = s`` yields the output ``ε |t_c| / M`` at range c of the window.
-
-``Yᴴ Y`` contains products of the same signals at lags up to K − 1, which neighbouring windows share and which do not
-depend on the phases of the weights. Each lane of a vector holds one window.
+docs/explanation/beamformers.md has the K × K system of a window of K ranges. Its products ``Yᴴ Y`` are of the same
+signals at lags up to K − 1, which neighbouring windows share. Each lane of a vector holds one window.
 """
 
 import math

@@ -1,8 +1,7 @@
 """Delay-and-sum and envelope in one pass, blocked for the registers and the L2 cache.
 
-A tile of ranges keeps all its sums in registers during the loop over microphones, so that each point costs only its
-load. Ranges are the outer loop. The signals of one tile (32 microphones, 10 phases, 64 ranges and the aperture: 215 kB)
-stay in the L2 cache while all directions of the block read them.
+A tile keeps all its sums in registers over the microphones. Its signals, 215 kB, stay in the L2 cache for all
+directions of a block.
 """
 
 import numpy as np

@@ -1,11 +1,7 @@
 """Unpack, decimate and remove the group delay in one pass over the PDM words.
 
-Bit m of a word decides if a tap is added for microphone m. One tap of all microphones of a word is one masked vector
-addition, ``sums += bits(word) ? tap : 0``. Since ``x = 2 · bit − 1``, the filtered signal is twice that sum minus the
-sum of the taps.
-
-With 16-bit taps, 32 microphones fit in one vector of AVX-512 or two of AVX2. This is about five times as fast as a
-table of the filter's response to 10 bits at a time.
+A tap of all microphones of a word is one masked vector addition, ``sums += bits(word) ? tap : 0``, and then ``x = 2 ·
+bit − 1``. This is five times as fast as a table of the response to 10 bits at a time.
 """
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Vectorised sums of 16-bit products.
 
-A complex sample is a pair of 16-bit numbers. The weights (re w, −im w) yield the real part of a beam, and (im w, re w)
-its imaginary part. A term therefore multiplies pairs, and adds both products of a pair to a 32-bit sum. The sums are
-integers, so all processors yield the same bits.
+A term multiplies pairs, by (re w, −im w) or (im w, re w), and adds both products to a 32-bit sum, which is exact.
 """
 
 import contextlib

@@ -1,8 +1,6 @@
 """Vectorised sums of complex products in single precision.
 
-Signals stay interleaved (re, im, re, im …). With ``a = Σ re(w) · x`` and ``b = Σ im(w) · x`` as plain vectors of
-floats, the beam is ``(a_re − b_im, a_im + b_re)``. A term therefore costs two multiply-adds per loaded vector and no
-shuffle. The parts are combined once, at the end.
+Interleaved, ``a = Σ re(w) · x`` and ``b = Σ im(w) · x`` give the beam ``(a_re − b_im, a_im + b_re)`` at the end.
 """
 
 import contextlib

@@ -1,8 +1,6 @@
 """CPU vectors for kernels that are recursive in time, with one lane per microphone.
 
-A `Lanes` holds one number per microphone and stays in registers. Compiled code computes ``a + b * c`` with them for all
-microphones at once. A plain loop over microphones would not keep the state of a recursion in registers. Nothing is
-contracted or reordered, so all processors yield the same bits.
+A `Lanes` stays in registers. Nothing is contracted or reordered, so all processors yield the same bits.
 """
 
 import operator
@@ -167,11 +165,8 @@ def store(typing_context, lanes, array, row):
 
 @intrinsic
 def turn_octet(typing_context, signals, rows, octet, sample, tile, n):
-    """Copy 8 samples of 8 signals: ``tile[n + j, 8 · octet + i] = signals[rows[8 · octet + i], sample + j]``.
-
-    All arrays are C-contiguous. Three rounds of exchanges between pairs of vectors transpose the samples, because
-    gathering numbers from eight rows takes as long as eight loads.
-    """
+    """Copy 8 samples of 8 signals: ``tile[n + j, 8 · octet + i] = signals[rows[8 · octet + i], sample + j]``."""
+    # Three rounds of exchanges between pairs of vectors transpose the samples: eight gathered numbers are eight loads.
     signature = types.void(signals, rows, types.intp, types.intp, tile, types.intp)
 
     def codegen(context, builder, signature, arguments):

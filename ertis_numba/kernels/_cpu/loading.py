@@ -1,8 +1,6 @@
 """Loading of compiled kernels from Numba's cache.
 
-Before Numba loads a function from its cache, it prepares its compiler: it imports its implementation of NumPy, and with
-it SciPy's linear algebra. This takes a tenth of the processor time of ``ertis process`` with one measurement. Compiled
-code needs neither, and every compilation prepares the compiler itself.
+Numba prepares its compiler before it loads a function, a tenth of the processor time of ``ertis process``.
 """
 
 import functools

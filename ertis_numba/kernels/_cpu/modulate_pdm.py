@@ -1,10 +1,7 @@
 """Convert signals to the bits of sigma-delta modulators, one per microphone.
 
-The loop is recursive in time, so microphones are processed in parallel: one or two octets of a word per set of vectors,
-and separate octets per thread. This is ten times as fast as a loop over one microphone at a time.
-
-Noise and dither are a hash of the microphone's key and the sample index, not a stream. The bits therefore depend
-neither on the number of threads nor on the size of blocks. Fastmath is off for the same reason.
+Octets of a word are processed in parallel, ten times as fast as one microphone at a time. Noise and dither are a hash
+of key and sample index, so that the bits depend neither on threads nor on blocks; fastmath is off.
 """
 
 import numpy as np

@@ -1,8 +1,7 @@
 """Sums over the terms of a beam.
 
-A warp handles one direction, and each thread `RANGES_PER_THREAD` ranges that are a warp apart. All threads share one
-load of a term's offset and weight, and samples are whole cache lines. Complex numbers are uint64 here, because a
-complex64 would take two loads. Indices are unsigned, because Numba tests signed ones for negative numbers.
+A warp handles one direction, and each thread `RANGES_PER_THREAD` ranges that are a warp apart. Complex numbers are
+uint64, which take one load, and indices are unsigned, which Numba does not test for negative numbers.
 """
 
 import numpy as np

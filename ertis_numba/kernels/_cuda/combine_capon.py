@@ -1,9 +1,7 @@
 # mypy: ignore-errors
 """Combine the microphones with minimum-variance weights; the method and its equations are those of the CPU kernel.
 
-Each thread handles one window of ranges at a time. Its matrix is in global memory, interleaved with those of the other
-threads. The image is split into groups of directions, so that the memory stays within `_MAX_BYTES` for any image.
-Numbers have the precision of the weights: with those of single precision, no operation is in double precision.
+Each thread handles one window of ranges at a time, with its matrix in interleaved global memory of `_MAX_BYTES`.
 """
 
 import math

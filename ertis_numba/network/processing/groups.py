@@ -47,10 +47,8 @@ class _Group:
 class Groups:
     """Grouping of measurements with the same pulse number; wrong data of one sensor never moves groups of others.
 
-    Counts of sessions differ by an offset, from the timestamp of the first measurement, and then from the sensor node's
-    monotonic clock: a system clock that is set by an hour moves no measurement into another group. If a timestamp is
-    impossible, the time of arrival counts: it lies in the future, or long ago although nothing older is caught up with.
-    A count that contradicts the time is aligned again. ``closed`` counts groups, and measurements that came too late.
+    Counts of sessions differ by an offset, from the timestamps of the first measurements, and then from the node's
+    monotonic clock, which no one sets. The time of arrival replaces impossible timestamps. ``closed`` counts groups.
     """
 
     def __init__(self) -> None:

@@ -54,8 +54,7 @@ class ImageProcessing:
     """Processing of measurements in worker processes, and publication of the images.
 
     It runs in the event loop of the intake: poll `fds`, call `ready` for each readable one, and `tick` at least ten
-    times a second. These calls wait for no other process and no disk. They take the time of copying a measurement, or
-    some milliseconds to start a process.
+    times a second. These calls wait for no other process and no disk.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog | None = None) -> None:

@@ -72,12 +72,8 @@ _NODE_HZ = 2000.0  # frequency step: the coherence of microphones 15 cm apart ch
 
 
 def sounds(shot: Snapshot, active: AbstractSet[str], seed: tuple[int, ...]) -> list[OverlappingFrames]:
-    """Return a diffuse sound field: independent plane waves of equal level from all directions.
-
-    The coherence of two microphones at a distance d is ``sin(k d) / (k d)`` (R. K. Cook et al., Measurement of
-    correlation coefficients in reverberant sound fields, JASA 27, 1955). The Cholesky factor of this matrix mixes
-    independent noises at each frequency.
-    """
+    """Return a diffuse sound field: independent plane waves of equal level from all directions."""
+    # The Cholesky factor of the coherence `sin(k d) / (k d)` mixes independent noises (R. K. Cook et al., 1955).
     ambient = shot.scene.ambient
     if ambient is None:
         return []

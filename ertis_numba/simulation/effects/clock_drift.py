@@ -16,14 +16,9 @@ Floats = NDArray[np.float64]
 
 
 def clock_times(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | None) -> tuple[Floats, Floats | None]:
-    """Return delays and stretches of an emitter's call on the clock of the receiving sensor.
-
-    Both clocks start with the SYNC, a time T before the measurement. A clock with drift d counts ``(1 + d)`` seconds
-    per second. An emitter with drift e emits when its own clock reads T. The call arrives
-    ``T (d - e) / (1 + e) + (1 + d) τ`` after the receiver's clock reads T, and lasts ``(1 + d) / (1 + e)`` times as
-    long. A sensor therefore measures each delay of its own echoes as ``(1 + d)`` times the true delay. Arguments
-    and results are (path, mic).
-    """
+    """Return delays and stretches of an emitter's call on the clock of the receiving sensor."""
+    # For drifts d and e since the SYNC, a time T before, the call arrives `T (d - e) / (1 + e) + (1 + d) τ` after the
+    # receiver's clock reads T, and lasts `(1 + d) / (1 + e)` times as long. Arrays are (path, mic).
     sensors = shot.sensor, shot.scene.sensors[number]
     listener, emitter = (1e-6 * sensor.electronics.clock_drift_ppm for sensor in sensors)
     late_s = since_sync_s(shot) * (listener - emitter) / (1 + emitter)

@@ -28,13 +28,9 @@ def times(
 
 
 def emission(shot: Snapshot, paths: Paths, received_s: Floats) -> Floats:
-    """Return the times at which sound that arrives at ``received_s`` (mic, time) left its source: (path, mic, time).
-
-    The source is at ``s(t)`` and a microphone at ``m(t)``, both with constant velocity. Sound that arrives at t left u
-    earlier, with ``|m(t) - s(t - u)| = c u``. With ``d = m(t) - s(t)`` and the velocity v of the source, u is the
-    positive root of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. The sound meets a moving wall after the same fraction of the
-    path as without motion, which is accurate to first order in v / c. ``paths`` have no targets.
-    """
+    """Return the times at which sound that arrives at ``received_s`` (mic, time) left its source: (path, mic, time)."""
+    # It left u earlier, the positive root of `(c² - v²) u² - 2 (d·v) u - d² = 0` for the source's velocity v and
+    # distance d. A moving wall is met after the same fraction of the path as without motion. `paths` have no targets.
     source, receiver, speed_m_s = paths.transmitter, paths.receiver, shot.speed_m_s
     # A wall moves the image from t - u until the time of reflection, so only a part of its velocity counts in v.
     done = paths.transmitter_corners_m / np.mean(paths.second_m, axis=1)
@@ -56,14 +52,9 @@ def _dot(one: Floats, other: Floats) -> Floats:
 
 
 def _moved(paths: Paths, speed_m_s: float, sent_s: float = 0.0) -> tuple[Floats, Floats]:
-    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic).
-
-    All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
-    ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. A microphone at r from the centre of a turning array
-    moves at ``v + ω × r``. The position of a wall is that at the time of reflection, accurate to first order in v / c
-    for oblique incidence. Amplitudes are those of objects at rest. The stretch dt₂/dt₀ equals the product of the
-    Doppler factors of all moving objects (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
-    """
+    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic)."""
+    # Sound meets the target at t₁ with `c (t₁ - t₀) = |p + v t₁ - s(t₀)|`, and then the microphone, which moves at `v +
+    # ω × r`, at t₂. The stretch is dt₂/dt₀ (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
     earlier_s, arrival_s, later_s = (
         _arrival_s(paths, sent_s + step_s, speed_m_s) for step_s in (-_STEP_S, 0.0, _STEP_S)
     )
@@ -101,11 +92,8 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
 
 
 def _met_s(from_m: Floats, left_s: Floats, place_m: Floats, velocity_m_s: Floats, speed_m_s: float) -> Floats:
-    """Return the times (path, mic) at which sound meets objects at ``place_m`` at time 0, in uniform motion.
-
-    Sound that leaves ``a`` at t₀ meets ``p + v t`` at ``t = t₀ + u``. With ``d = p + v t₀ - a``, u is the positive root
-    of ``(c² - v²) u² - 2 (d·v) u - d² = 0``.
-    """
+    """Return the times (path, mic) at which sound meets objects at ``place_m`` at time 0, in uniform motion."""
+    # With `d = p + v t₀ - a`, it takes the positive root u of `(c² - v²) u² - 2 (d·v) u - d² = 0`.
     apart_m = place_m + velocity_m_s * left_s[..., None] - from_m
     along = np.sum(apart_m * velocity_m_s, axis=-1)
     rest = speed_m_s**2 - np.sum(velocity_m_s**2, axis=-1)

@@ -28,12 +28,7 @@ class _Resonance:
     quality: float
 
     def response(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the response ``H(f) = 1 / (1 + j Q (f / f₀ - f₀ / f))``, 1 at the resonance.
-
-        This is the current in the series branch of the Butterworth-Van Dyke circuit (K. S. Van Dyke, The piezo-electric
-        resonator and its equivalent network, Proc. IRE 16, 1928). Its bandwidth is ``f₀ / Q``; after the call it rings
-        as ``exp(-π f₀ t / Q)``.
-        """
+        """Return the response ``H(f) = 1 / (1 + j Q (f / f₀ - f₀ / f))``, 1 at the resonance."""
         ratio = frequency_hz / self.resonance_hz
         damped = 1j * ratio / self.quality
         return np.asarray(damped / (1 - ratio**2 + damped))

@@ -21,13 +21,9 @@ def gain(shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[n
 
 
 def spreading(paths: Paths) -> NDArray[np.float64]:
-    """Return the amplitude gain due to geometric spreading: (path, mic).
-
-    A point re-radiates the sound that it receives, ``1 / (r₁ r₂)``. A plane mirror does not, ``1 / (r₁ + r₂)``. A
-    sphere of radius a lies between the two, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and
-    ``B = r₁ + r₂ + 2 r₁ r₂ cos θ / a``. Here θ is the angle of incidence; normal incidence gives ``a / (2 r (r + a))``.
-    The law describes the widening of a ray tube at a curved mirror (A. D. Pierce, Acoustics, 1989, chapter 8).
-    """
+    """Return the amplitude gain due to geometric spreading: (path, mic)."""
+    # Spheres have `1 / √(A B)` with `A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)` and `B = r₁ + r₂ + 2 r₁ r₂ cos θ / a` for the
+    # angle of incidence θ (A. D. Pierce, Acoustics, 1989, chapter 8).
     first_m, second_m = paths.first_m, paths.second_m
     if not len(paths.targets):
         return np.asarray(1 / np.maximum(first_m + second_m, NEAREST_M))

@@ -26,12 +26,8 @@ _FAR = 0.02  # below this u, the far field of a disc is accurate to a few thousa
 
 
 def turns(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) -> Paths:
-    """Return paths that turn on the surface of spheres instead of at their centres.
-
-    At the mirror point, the surface normal bisects the angle between the legs. The directions from the centre to both
-    ends approximate those from the surface. This is exact for equal distances; otherwise the error is of third order in
-    radius / distance.
-    """
+    """Return paths that turn on the surface of spheres instead of at their centres."""
+    # The normal bisects the angle between the legs. Directions from the centre approximate those from the surface.
     if not np.any(targets.radius_m):
         return by_targets(first, second, targets)
     centre_m = targets.positions_m[first.place, None, :]
@@ -43,12 +39,8 @@ def turns(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) 
 def gain(
     shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: Floats
 ) -> Floats | NDArray[np.complex128] | float:
-    """Return the gain of echoes due to the size of their targets: (path, mic, frequency), 1 for points.
-
-    Spheres of a few wavelengths follow `_rigid_sphere`, and larger ones are mirrors. Discs follow `_disc`; their echo
-    is 0 unless emitter and microphone lie in the half space that the disc faces. It is complex if a target shifts
-    phases.
-    """
+    """Return the gain of echoes due to the size of their targets: (path, mic, frequency), 1 for points."""
+    # Spheres follow `_rigid_sphere`, or are mirrors if large. Discs follow `_disc`, on the side that they face.
     targets = paths.targets
     if not len(targets):
         return 1.0
@@ -78,13 +70,9 @@ def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDAr
 
 
 def _disc(tilt: Floats, nearness: Floats) -> NDArray[np.complex128]:
-    """Return the echo relative to the far-field echo along the normal, ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``.
-
-    This is Kirchhoff's integral over a disc in Fresnel's approximation, as for the field near the focus of a lens (M.
-    Born, E. Wolf, Principles of Optics, 7th edition, section 8.8): ``exp(-j u / 4) sin(u / 4) / (u / 4)`` on the axis,
-    ``2 J₁(v) / v`` in the far field. ``tilt``: ``v = k a |s|``, with the component s in the disc's plane of the sum of
-    the unit vectors towards emitter and microphone. ``nearness``: ``u = k a² (1 / r₁ + 1 / r₂)``.
-    """
+    """Return the echo relative to the far-field echo along the normal, ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``."""
+    # Kirchhoff's integral in Fresnel's approximation (M. Born, E. Wolf, section 8.8). `tilt` is `v = k a |s|` for the
+    # component s in the plane of the sum of unit vectors; `nearness` is `u = k a² (1 / r₁ + 1 / r₂)`.
     found = piston(tilt).astype(np.complex128)
     near = nearness > _FAR
     if near.any():
@@ -105,15 +93,9 @@ def _nodes(count: int) -> tuple[Floats, Floats]:
 
 
 def _rigid_sphere(radius_m: Floats, wave: Floats, cos_turn: Floats) -> NDArray[np.complex128]:
-    """Return the echo relative to that of a curved mirror: (path, mic, frequency).
-
-    The echo is the partial-wave series of a rigid sphere in a plane wave,
-    ``f = -(j / k) Σ (2n + 1) jₙ'(ka) / hₙ'(ka) Pₙ(cos Θ)``. The time factor is ``exp(jωt)``, so the spherical Hankel
-    functions are of the second kind (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, section 8.2). The echo of
-    the mirror is ``(a / 2) exp(2 j k a sin(Θ / 2))``, relative to the sphere's centre. For small k a the ratio falls as
-    (k a)² (Rayleigh scattering); near k a = 1 the creeping wave around the sphere makes it oscillate. ``wave`` are wave
-    numbers, and ``cos_turn`` (path, mic) cosines of the scattering angle Θ; -1 is backscatter.
-    """
+    """Return the echo relative to that of a curved mirror: (path, mic, frequency)."""
+    # The series is `-(j / k) Σ (2n + 1) jₙ'(ka) / hₙ'(ka) Pₙ(cos Θ)` for `exp(jωt)` (P. M. Morse, K. U. Ingard, 1968,
+    # section 8.2), that of the mirror `(a / 2) exp(2 j k a sin(Θ / 2))`. `cos_turn` (path, mic) is -1 for backscatter.
     found = np.empty((*cos_turn.shape, len(wave)), dtype=np.complex128)
     for radius in np.unique(radius_m):
         chosen = radius_m == radius
