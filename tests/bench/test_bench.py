@@ -29,7 +29,7 @@ from ertis_cli.main import cli
 
 from ertis_numba import figures, kernels
 from ertis_numba.base.errors import ArgumentError, DataError
-from ertis_numba.kernels._cpu import ceilings
+from ertis_numba.kernels.benchmarks import ceilings_of_cpu as ceilings
 from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.pipeline.prediction import Prediction
 from ertis_numba.settings import ERROR_PRESETS_DB

@@ -10,8 +10,8 @@ from numba import cuda
 
 from ertis_numba import kernels
 from ertis_numba.base.errors import DataError, DeviceError
-from ertis_numba.kernels._cuda import ceilings
-from ertis_numba.kernels._cuda.stopwatch import Stopwatch
+from ertis_numba.kernels.benchmarks import ceilings_of_cuda as ceilings
+from ertis_numba.kernels.benchmarks.stopwatch import Stopwatch
 from ertis_numba.pipeline import Pipeline
 from tests.cases import noise
 from tests.cuda.plans import DIRECT, TINY

@@ -10,7 +10,7 @@ from ertis_bench import checks, input_measurements, machine, timing
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_numba import kernels
-from ertis_numba.kernels._cpu import ceilings
+from ertis_numba.kernels.benchmarks import ceilings_of_cpu as ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Settings
 

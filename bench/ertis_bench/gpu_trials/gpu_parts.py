@@ -28,7 +28,7 @@ from ertis_numba import kernels
 from ertis_numba.base.errors import DataError, DeviceError
 from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Measurement
-from ertis_numba.kernels._cuda import ceilings
+from ertis_numba.kernels.benchmarks import ceilings_of_cuda as ceilings
 from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Settings

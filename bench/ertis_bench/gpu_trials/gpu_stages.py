@@ -13,8 +13,8 @@ from ertis_bench.plans import BEAMFORMING_KERNELS
 from ertis_numba import kernels
 from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.kernels import KernelSet, Lane, Memory
-from ertis_numba.kernels._cuda.ceilings import occupy
-from ertis_numba.kernels._cuda.stopwatch import Stopwatch
+from ertis_numba.kernels.benchmarks.ceilings_of_cuda import occupy
+from ertis_numba.kernels.benchmarks.stopwatch import Stopwatch
 from ertis_numba.settings import Settings
 
 __all__ = ["STAGES", "TRANSFERS", "stages"]

@@ -8,7 +8,7 @@ from numba import cuda
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._cuda.lane import SIMULATED, launch
-from ertis_numba.kernels._cuda.stopwatch import Stopwatch
+from ertis_numba.kernels.benchmarks.stopwatch import Stopwatch
 
 __all__ = ["TURN_LOADS", "TURN_MULTIPLY_ADDS", "ceilings", "load", "multiply_add", "occupy", "properties"]
 
