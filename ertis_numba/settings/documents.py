@@ -224,7 +224,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         wanted = f"a {cls.__name__.lower()} file (TOML)"
         text = _text_of(path, wanted)
         try:
-            return cls.from_toml(text, str(path)), msgspec.toml.decode(text)
+            return cls.from_toml(text, str(path)), cls._tables(text)
         except SettingsError as error:
             if type(error.__cause__) is not msgspec.DecodeError or path.suffix.lower() == ".toml":
                 raise
@@ -232,7 +232,13 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
     @classmethod
     def _decoded(cls, text: str) -> Self:
-        return msgspec.convert(msgspec.toml.decode(text), cls, builtin_types=_TOML_TYPES, str_keys=True)
+        return msgspec.convert(cls._tables(text), cls, builtin_types=_TOML_TYPES, str_keys=True)
+
+    @classmethod
+    def _tables(cls, text: str) -> dict[str, Any]:
+        """Return the tables of a text; a document may have further spellings of its keys."""
+        tables: dict[str, Any] = msgspec.toml.decode(text)
+        return tables
 
     def to_toml(self) -> str:
         """Return TOML text that `from_toml` reads back to an equal structure."""

@@ -95,7 +95,7 @@ def _searched(part: str, say: Callable[[str], None], duration_s: float, seed: in
 
 
 def capacity(report: Found) -> str:
-    """Return the table of the largest numbers, with what fails beyond them and the processor time."""
+    """Return the table of the largest numbers, the faults beyond them, and the processor time."""
     head = ("", "largest", "p50 / p99, ms", "processor time, % of one core", "beyond")
     cells = []
     for row in report["rows"]:

@@ -31,7 +31,9 @@ def _seed(about: str, *, default: int = 0) -> Callable[..., Any]:
     return _number("--seed", default, about, least=0, metavar="S")
 
 
-def _quantity(name: str, variable: str, limits: click.FloatRange, default: float, metavar: str, about: str) -> Any:
+def _quantity(
+    name: str, variable: str, limits: click.FloatRange, default: float, metavar: str, about: str
+) -> Callable[..., Any]:
     """Return the option of a number with a unit."""
     return click.option(name, variable, type=limits, default=default, show_default=True, metavar=metavar, help=about)
 
