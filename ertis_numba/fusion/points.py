@@ -23,7 +23,7 @@ from ertis_numba.fusion.sensor_echoes import SensorEchoes
 from ertis_numba.fusion.sight import tangents
 from ertis_numba.geometry import Grid
 
-__all__ = ["HeardImage", "PointFuser", "joined"]
+__all__ = ["N_KEPT", "HeardImage", "PointFuser", "joined"]
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +38,8 @@ _ANGLE_SD_RAD: Final = math.radians(0.125)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
 _UNKNOWN_ANGLE_SD_RAD: Final = math.radians(1.0)
 _NEAREST_M: Final = 0.05
-_N_KEPT: Final = 3  # Images of a sensor that are heard once only: that of the fused pulse, and those that wait.
+N_KEPT: Final = 3
+"""Images of a sensor that are heard once only: that of the fused pulse, and those that wait."""
 _BESIDE: Final = np.arange(-1, 2)
 
 
@@ -94,7 +95,7 @@ class PointFuser:
             _, known = self._kept.setdefault(id(image), (image, result))
             if known is not result:
                 return known
-            for earlier in [*self._kept][:-_N_KEPT]:
+            for earlier in [*self._kept][:-N_KEPT]:
                 self._kept.pop(earlier, None)
             floor = _floor(image)
             result.set_result(HeardImage(floor, self._echoes(image, floor)))

@@ -26,7 +26,7 @@ from ertis_numba.fusion.emissions import (
 )
 from ertis_numba.fusion.known_echoes import explained_shares, levelled
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
-from ertis_numba.fusion.points import PointFuser, joined
+from ertis_numba.fusion.points import N_KEPT, PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
@@ -100,6 +100,7 @@ class FusionTables:
         self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
         self._rivalries: Rivalries = {}
         self._points: dict[int, PointFuser] = {}
+        self._coarse: dict[int, tuple[Energyscape, CoarseImage]] = {}  # by identity of the image
         self._converted: dict[str, tuple[Settings, Settings]] = {}  # The checks of settings take long.
 
     def fit(self, group: Mapping[int, Energyscape], diameters_m: Mapping[int, float]) -> bool:
@@ -116,15 +117,21 @@ class FusionTables:
         return self.fit(group, diameters_m) and group.keys() <= self._receivers.keys() and _key(group) in self._known
 
     def prepare(self, number: int, image: Energyscape) -> None:
-        """Find the echoes of an image of a receiver whose tables exist. Threads may call it."""
+        """Compute the powers and the echoes of an image of a receiver whose tables exist. Threads may call it."""
         if number in self._points:
+            self.coarse(number, image)
             self._points[number].find(image)
 
     def coarse(self, number: int, image: Energyscape) -> CoarseImage:
-        """Return the powers of an image of a receiver."""
+        """Return the powers of an image of a receiver, computed once for the latest images. Threads may call it."""
         if number not in self._receivers:
             self._add(number, image)
-        return self._receivers[number].coarse(image, self._deaf[number])
+        known = self._coarse.get(id(image))
+        if known is None:
+            known = self._coarse[id(image)] = image, self._receivers[number].coarse(image, self._deaf[number])
+            for earlier in [*self._coarse][: -N_KEPT * len(self._sensors)]:
+                self._coarse.pop(earlier, None)
+        return known[1]
 
     def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
         """Return the attribution of echoes in the images of a group, for pairs with equal calls that were emitted."""
