@@ -64,8 +64,7 @@ class Search:
     ) -> None:
         self._echoes, self._viewers, self._locator = echoes, viewers, locator
         self._grid, self._bound = grid, bound
-        self._is_incomplete, self._heard = echoes.is_incomplete, echoes.matched()
-        self._match = kernels.load_fusion().match_echoes
+        self._is_incomplete, self._match = echoes.is_incomplete, kernels.load_fusion().match_echoes
         self.is_free = ~echoes.is_faint
         candidates = self._candidates()
         self.found = locator.refined(locator.measured(self._confirmed(candidates)))
@@ -103,23 +102,12 @@ class Search:
         self, candidates: _Candidates, sight: kernels.SeenPlaces, extra_m: float
     ) -> tuple[Numbers, Numbers, Numbers, Floats]:
         """Return the free echoes that candidates predict: candidate, echo, emitter and squared distance."""
-        across = candidates.across
         # Echoes of a reflector show about the same reflectivity; those from behind may be weaker.
-        places = kernels.PredictedPlaces(
-            sight.apart_m,
-            sight.seen,
-            sight.depth,
-            np.einsum("psi,pi->ps", sight.toward, across),
-            np.einsum("pi,pi->p", across, across),
-            candidates.reflectivity[:, None, None] * sight.gain,
-            sight.beside_m**2 + extra_m**2,
-            self._viewers.is_flat,
-        )
-        chosen = np.flatnonzero(self.is_free)
-        count = _FEW
+        places = sight, candidates.across, candidates.reflectivity, extra_m, self._viewers.is_flat
+        chosen, count = np.flatnonzero(self.is_free), _FEW
         while True:
             found, distance = np.empty((3, count), np.int64), np.empty(count)
-            n_found = self._match(places, self._heard, chosen, _GATE, _ALIKE, found, distance)
+            n_found = self._match(*places, self._locator.heard, chosen, _GATE, _ALIKE, found, distance)
             if n_found <= count:
                 which, echo, emitter = found[:, :n_found]
                 return which, echo, emitter, distance[:n_found]

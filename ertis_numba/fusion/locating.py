@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap, summed_m2
 from ertis_numba.fusion.sensor_echoes import PulseEchoes
-from ertis_numba.fusion.sight import Viewers, mirrored
+from ertis_numba.fusion.sight import Viewers
 
 __all__ = ["NEAREST_M", "OUTLIER", "LocatedReflector", "Locator", "median_of"]
 
@@ -26,6 +26,7 @@ OUTLIER: Final = 2.0
 _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
 _TINY: Final = 1e-30
 _ROUNDS: Final = 8
+_NONE: Final = np.empty((0, 2))
 _RESOLUTION_M: Final = 0.014  # Difference of paths that separates two echoes.
 # Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
 _LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
@@ -47,28 +48,20 @@ class Locator:
 
     def __init__(self, echoes: PulseEchoes, viewers: Viewers, pulse_m: Floats, beam: Floats) -> None:
         self._echoes, self._viewers, self._pulse_m, self._beam = echoes, viewers, pulse_m, beam
-        self._locate = kernels.load_fusion().locate_reflector
+        self.heard, self._locate = echoes.matched(), kernels.load_fusion().locate_reflector
 
     def located(
-        self, members: Numbers, emitter: Numbers, place_m: Floats, added: Floats | None = None
+        self, members: Numbers, emitter: Numbers, place_m: Floats, added: Floats = _NONE
     ) -> tuple[Floats, Floats]:
         """Return the position of a reflector and its covariance; ``added`` are more variances, (member, 2)."""
-        deviation = self._echoes.deviation[members]
-        if added is not None:
-            deviation = np.sqrt(deviation**2 + added)
-        receiver, axes = self._echoes.receiver[members], self._echoes.axes[members]
-        ahead = self._viewers.ahead[receiver]
-        is_behind = np.einsum("ei,ei->e", place_m - self._viewers.sensor_m[receiver], ahead) < 0
-        if is_behind.any():
-            axes = np.where(is_behind[:, None, None], mirrored(axes, ahead[:, None]), axes)
-        position_m, covariance_m2 = place_m.copy(), np.empty((3, 3))
-        is_alone = len(members) == 1
+        position_m, covariance_m2, is_alone = place_m.copy(), np.empty((3, 3)), len(members) == 1
         self._locate(
-            self._viewers.sensor_m[emitter],
-            self._viewers.sensor_m[receiver],
-            self._echoes.path_m[members, emitter],
-            axes,
-            deviation,
+            self._viewers.sensor_m,
+            self._viewers.ahead,
+            self.heard,
+            members,
+            emitter,
+            added,
             _LEAST_INFORMATION_1_M2,
             NEAREST_M,
             math.inf if is_alone else OUTLIER,

@@ -100,4 +100,6 @@ class PulseEchoes(NamedTuple):
     def matched(self) -> kernels.HeardEchoes:
         """Return the echoes as `kernels.MatchEchoes` takes them."""
         gate_m2 = self.deviation[:, 0] ** 2 + _MOUNTED_M**2
-        return kernels.HeardEchoes(self.receiver, self.direction, self.path_m, self.gate_rad**2, gate_m2, self.power)
+        return kernels.HeardEchoes(
+            self.receiver, self.path_m, self.axes, self.deviation, self.gate_rad**2, gate_m2, self.power
+        )

@@ -13,7 +13,6 @@ from ertis_numba.kernels._contract.fusion import (
     SPREADING_M,
     FusionKernels,
     HeardEchoes,
-    PredictedPlaces,
     SeenPlaces,
     ViewingSensors,
 )
@@ -60,7 +59,6 @@ __all__ = [
     "MappingKernels",
     "Memory",
     "PointKernels",
-    "PredictedPlaces",
     "Pulse",
     "Quadrics",
     "SeenPlaces",

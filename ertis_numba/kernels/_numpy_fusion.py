@@ -26,7 +26,6 @@ from ertis_numba.kernels._contract.fusion import (
     FusionKernels,
     HeardEchoes,
     Places,
-    PredictedPlaces,
     SeenPlaces,
     Truths,
     ViewingSensors,
@@ -190,11 +189,12 @@ def compare_echoes(
 
 
 def locate_reflector(
-    emitter_m: Doubles,
-    receiver_m: Doubles,
-    path_m: Doubles,
-    axes: Doubles,
-    deviation: Doubles,
+    sensor_m: Doubles,
+    ahead: Doubles,
+    echoes: HeardEchoes,
+    echo: Places,
+    emitter: Places,
+    added: Doubles,
     information: float,
     nearest_m: float,
     outlier: float,
@@ -203,11 +203,18 @@ def locate_reflector(
     out: Doubles,
 ) -> None:
     """Locate a reflector by the paths and directions of its echoes."""
+    deviation, axes, receiver = echoes.deviation[echo], echoes.axes[echo, 1:], echoes.receiver[echo]
+    if len(added):
+        deviation = np.sqrt(deviation**2 + added)
+    is_behind = np.einsum("ei,ei->e", position_m - sensor_m[receiver], ahead[receiver]) < 0
+    beyond = np.where(is_behind[:, None], np.einsum("eti,ei->et", axes, ahead[receiver]), 0.0)
+    axes = axes - 2 * beyond[..., None] * ahead[receiver, None]
+    path_m = echoes.path_m[echo, emitter]
     for _ in range(n_rounds):
-        away_m, back_m = position_m - emitter_m, position_m - receiver_m
+        away_m, back_m = position_m - sensor_m[emitter], position_m - sensor_m[receiver]
         from_m, to_m = (np.maximum(nearest_m, np.linalg.norm(each, axis=1))[:, None] for each in (away_m, back_m))
         along = (away_m / from_m + back_m / to_m) / deviation[:, :1]
-        across = axes[:, 1:] / (to_m * deviation[:, 1:])[:, None]
+        across = axes / (to_m * deviation[:, 1:])[:, None]
         slopes = np.concatenate([along, across.reshape(-1, 3)])
         late = (path_m[:, None] - from_m - to_m) / deviation[:, :1]
         residual = np.concatenate([late[:, 0], -np.einsum("eti,ei->et", across, back_m).ravel()])
@@ -217,7 +224,11 @@ def locate_reflector(
 
 
 def match_echoes(
-    places: PredictedPlaces,
+    places: SeenPlaces,
+    across: Doubles,
+    reflectivity: Doubles,
+    extra_m: float,
+    is_flat: Truths,
     echoes: HeardEchoes,
     chosen: Places,
     gate: float,
@@ -227,14 +238,15 @@ def match_echoes(
 ) -> int:
     """Find the echoes that reflectors at given places explain, by path, direction and power."""
     here, to_m = echoes.receiver[chosen], places.apart_m[:, echoes.receiver[chosen]]
-    turned = np.maximum(0.0, 2 - 2 * np.einsum("pei,ei->pe", places.seen[:, here], echoes.direction[chosen]))
-    turned /= places.across_m2[:, None] / to_m**2 + echoes.gate_rad2[chosen]
-    place, one = np.nonzero((turned < gate) & (places.is_flat[here] | (places.depth[:, here] >= 0)))
+    turned = np.maximum(0.0, 2 - 2 * np.einsum("pei,ei->pe", places.seen[:, here], echoes.axes[chosen, 0]))
+    turned /= np.sum(across**2, axis=1)[:, None] / to_m**2 + echoes.gate_rad2[chosen]
+    place, one = np.nonzero((turned < gate) & (is_flat[here] | (places.depth[:, here] >= 0)))
     turned, echo, here = turned[place, one, None], chosen[one], here[one]
     late_m = echoes.path_m[echo] - places.apart_m[place] - places.apart_m[place, here, None]
-    along_m = places.slope_m[place] + places.slope_m[place, here, None]
-    distance = turned + late_m**2 / (along_m**2 + echoes.gate_m2[echo, None] + places.extra_m2[place])
-    expected, power = places.expected[place, here], echoes.power[echo, None]
+    slope_m = np.einsum("psi,pi->ps", places.toward, across)
+    along_m = slope_m[place] + slope_m[place, here, None]
+    distance = turned + late_m**2 / (along_m**2 + echoes.gate_m2[echo, None] + places.beside_m[place] ** 2 + extra_m**2)
+    expected, power = reflectivity[place, None] * places.gain[place, here], echoes.power[echo, None]
     is_alike = (power < alike * expected) & ((places.depth[place, here, None] < 0) | (alike * power > expected))
     entry, emitter = np.nonzero((distance < gate) & is_alike)
     n_kept = min(len(entry), len(out))

@@ -23,39 +23,48 @@ NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
 
 
 def echoes(draws, count=5):
-    """Emitters, receivers, paths, axes and deviations of the echoes of a reflector at (1.1, 0.9, 1.0)."""
-    emitter_m, receiver_m = draws.normal(scale=0.2, size=(2, count, 3))
-    to_m = np.array([1.1, 0.9, 1.0]) - receiver_m
+    """Sensors, the echoes of a reflector at (1.1, 0.9, 1.0), some of them from behind, and added variances."""
+    sensor_m, ahead = draws.normal(scale=0.2, size=(2 * count, 3)), draws.normal(size=(2 * count, 3))
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    emitter, receiver = np.arange(count), np.arange(count, 2 * count)
+    to_m = np.array([1.1, 0.9, 1.0]) - sensor_m
     range_m = np.linalg.norm(to_m, axis=1)
-    path_m = range_m + np.linalg.norm(np.array([1.1, 0.9, 1.0]) - emitter_m, axis=1)
-    path_m += [0.0, 0.001, -0.001, 0.0, 0.05]  # The last echo is an outlier.
-    axes = np.stack([np.linalg.qr(np.column_stack([each, np.eye(3)[:, :2]]))[0].T for each in to_m])
-    deviation = np.tile([0.002, 0.005], (count, 1))
-    return emitter_m, receiver_m, path_m, axes, deviation
+    path_m = range_m[:, None] + range_m
+    path_m = path_m[receiver] + np.array([0.0, 0.001, -0.001, 0.0, 0.05])[:, None]  # The last echo is an outlier.
+    axes = np.stack([np.linalg.qr(np.column_stack([each, np.eye(3)[:, :2]]))[0].T for each in to_m[receiver]])
+    is_behind = np.einsum("ei,ei->e", to_m[receiver], ahead[receiver]) < 0
+    assert 0 < is_behind.sum() < count
+    mirror = np.eye(3) - 2 * is_behind[:, None, None] * np.einsum("ei,ej->eij", ahead[receiver], ahead[receiver])
+    deviation, unused = np.tile([0.002, 0.005], (count, 1)), np.zeros((3, count))
+    heard = kernels.HeardEchoes(receiver, path_m, axes @ mirror, deviation, *unused)
+    return sensor_m, ahead, heard, np.arange(count), emitter, draws.uniform(0.0, 1e-6, (count, 2))
 
 
-def matches(draws, n_places=6, n_echoes=40, n_sensors=3):
+def matches(draws, n_places=6, n_echoes=60, n_sensors=3):
     """Places, and the echoes of those places with small errors: some are loud, from behind, or of unknown paths."""
     apart_m = draws.uniform(0.5, 3.0, (n_places, n_sensors))
-    seen = draws.normal(size=(n_places, n_sensors, 3))
+    seen, toward = draws.normal(size=(2, n_places, n_sensors, 3))
     seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-    places = kernels.PredictedPlaces(
+    toward /= np.linalg.norm(toward, axis=2, keepdims=True)
+    places = kernels.SeenPlaces(
         apart_m=apart_m,
-        seen=seen,
+        toward=toward,
         depth=draws.uniform(-0.3, 1.0, (n_places, n_sensors)),
-        slope_m=draws.normal(scale=1e-3, size=(n_places, n_sensors)),
-        across_m2=draws.uniform(1e-5, 1e-4, n_places),
-        expected=draws.uniform(0.5, 1.5, (n_places, n_sensors, n_sensors)),
-        extra_m2=np.full((n_places, n_sensors), 1e-5),
-        is_flat=np.array([True, False, True]),
+        seen=seen,
+        radiated=np.ones((n_places, n_sensors)),
+        gain=draws.uniform(0.5, 1.5, (n_places, n_sensors, n_sensors)),
+        beside_m=draws.uniform(0.0, 3e-3, (n_places, n_sensors)),
     )
+    across, reflectivity = draws.normal(scale=2e-3, size=(n_places, 3)), draws.uniform(0.9, 1.1, n_places)
     place, receiver = draws.integers(0, n_places, n_echoes), draws.integers(0, n_sensors, n_echoes)
     path_m = apart_m[place] + apart_m[place, receiver, None] + draws.normal(scale=4e-3, size=(n_echoes, n_sensors))
     path_m[draws.random(path_m.shape) < 0.2] = np.nan
-    direction = seen[place, receiver] + draws.normal(scale=5e-3, size=(n_echoes, 3))
+    axes, deviation = np.ones((n_echoes, 3, 3)), np.ones((n_echoes, 2))
+    axes[:, 0] = seen[place, receiver] + draws.normal(scale=5e-3, size=(n_echoes, 3))
     variances = np.full((2, n_echoes), [[2e-5], [8e-6]])
-    power = draws.choice([0.2, 1.0, 5.0], n_echoes)
-    return places, kernels.HeardEchoes(receiver, direction, path_m, *variances, power), np.arange(3, n_echoes)
+    heard = kernels.HeardEchoes(receiver, path_m, axes, deviation, *variances, draws.choice([0.2, 1.0, 5.0], n_echoes))
+    is_flat = np.array([True, False, True])
+    return places, across, reflectivity, 2e-3, is_flat, heard, np.arange(3, n_echoes)
 
 
 def arrivals(draws, n_sources=15, n_echoes=60, n_sensors=3):
@@ -214,7 +223,7 @@ def test_match_echoes_counts_matches_beyond_its_space(load):
     place, echo, emitter = found[:, :n_all]
     assert len({*zip(place, echo, emitter, strict=True)}) == n_all
     assert echo.min() >= 3
-    assert np.isfinite(given[1].path_m[echo, emitter]).all()
+    assert np.isfinite(given[5].path_m[echo, emitter]).all()
     assert distance[:n_all].max() < 16.0
 
 

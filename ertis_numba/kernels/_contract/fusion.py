@@ -23,7 +23,6 @@ __all__ = [
     "SPREADING_M",
     "FusionKernels",
     "HeardEchoes",
-    "PredictedPlaces",
     "SeenPlaces",
     "ViewingSensors",
 ]
@@ -222,86 +221,6 @@ class CompareEchoes(Protocol):
     ) -> None: ...
 
 
-class LocateReflector(Protocol):
-    """Locate a reflector by the paths and directions of its echoes; ``position_m`` starts at a first estimate.
-
-    Least squares with the weights of a Cauchy distribution (P. J. Huber, E. M. Ronchetti, Robust Statistics, 2009),
-    because echoes that overlap at one sensor shift its direction or range by far more than noise does. ``axes`` (echo,
-    3, axis): direction from the receiver, and two unit vectors across; ``deviation`` (echo, 2): of the path in m and of
-    the direction in rad. ``information`` in 1/m² about each coordinate is known beforehand. ``outlier``: residual in
-    standard deviations that has half of the weight; infinite for plain least squares. ``out`` (axis, axis): covariance
-    before the last update.
-    """
-
-    def __call__(
-        self,
-        emitter_m: Doubles,
-        receiver_m: Doubles,
-        path_m: Doubles,
-        axes: Doubles,
-        deviation: Doubles,
-        information: float,
-        nearest_m: float,
-        outlier: float,
-        n_rounds: int,
-        position_m: Doubles,
-        out: Doubles,
-    ) -> None: ...
-
-
-class PredictedPlaces(NamedTuple):
-    """Possible reflectors as the sensors see them.
-
-    Distances ``apart_m``, directions ``seen`` in which echoes appear, and cosines ``depth`` to the axes of the sensors,
-    negative behind: (place, sensor, …). ``slope_m``: change of distances over one standard deviation of the place;
-    ``across_m2``: its square across the direction. ``expected`` (place, receiver, emitter): powers. ``extra_m2``
-    (place, emitter): variances of paths beside those of the echoes. ``is_flat`` receivers hear echoes from behind.
-    """
-
-    apart_m: Doubles
-    seen: Doubles
-    depth: Doubles
-    slope_m: Doubles
-    across_m2: Doubles
-    expected: Doubles
-    extra_m2: Doubles
-    is_flat: Truths
-
-
-class HeardEchoes(NamedTuple):
-    """Echoes in the images of all receivers; ``path_m`` (echo, emitter) is NaN if its call did not cause the echo.
-
-    ``gate_rad2`` and ``gate_m2`` are the variances of directions and of paths.
-    """
-
-    receiver: Places
-    direction: Doubles
-    path_m: Doubles
-    gate_rad2: Doubles
-    gate_m2: Doubles
-    power: Doubles
-
-
-class MatchEchoes(Protocol):
-    """Find the echoes that reflectors at given places explain, by path, direction and power; return their number.
-
-    The number may exceed the space for them. ``chosen``: echoes to match. ``gate``: largest sum of squares, in
-    variances. ``alike``: largest ratio of the power to the expected one; echoes from behind may be weaker. Outputs:
-    ``found`` (3, count), place, echo and emitter of the first matches, and their sums of squares.
-    """
-
-    def __call__(
-        self,
-        places: PredictedPlaces,
-        echoes: HeardEchoes,
-        chosen: Places,
-        gate: float,
-        alike: float,
-        found: Places,
-        out: Doubles,
-    ) -> int: ...
-
-
 class ViewingSensors(NamedTuple):
     """Sensors of a platform, and the sound that their emitters radiate; ``is_flat`` receivers hear echoes from behind.
 
@@ -340,6 +259,78 @@ class SeenPlaces(NamedTuple):
     def only(self, number: int) -> "SeenPlaces":
         """Return one of the places."""
         return SeenPlaces._make(each[number : number + 1] for each in self)
+
+
+class HeardEchoes(NamedTuple):
+    """Echoes in the images of all receivers; ``path_m`` (echo, emitter) is NaN if its call did not cause the echo.
+
+    ``axes`` (echo, 3, axis) are the direction from the receiver and two unit vectors across, ``deviation`` (echo, 2)
+    those of the path in m and of the direction in rad. ``gate_rad2`` and ``gate_m2`` are the variances of directions
+    and of paths in a search.
+    """
+
+    receiver: Places
+    path_m: Doubles
+    axes: Doubles
+    deviation: Doubles
+    gate_rad2: Doubles
+    gate_m2: Doubles
+    power: Doubles
+
+
+class LocateReflector(Protocol):
+    """Locate a reflector by the paths and directions of its echoes; ``position_m`` starts at a first estimate.
+
+    Least squares with the weights of a Cauchy distribution (P. J. Huber, E. M. Ronchetti, Robust Statistics, 2009),
+    because echoes that overlap at one sensor shift its direction or range by far more than noise does. ``echo`` and
+    ``emitter`` (member,) are its echoes, with ``added`` variances (member, 2), none if it is empty. Receivers hear
+    echoes from behind in front. ``information`` in 1/m² about each coordinate is known beforehand. ``outlier``:
+    residual in standard deviations that has half of the weight; infinite for plain least squares. ``out`` (axis, axis):
+    covariance before the last update.
+    """
+
+    def __call__(
+        self,
+        sensor_m: Doubles,
+        ahead: Doubles,
+        echoes: HeardEchoes,
+        echo: Places,
+        emitter: Places,
+        added: Doubles,
+        information: float,
+        nearest_m: float,
+        outlier: float,
+        n_rounds: int,
+        position_m: Doubles,
+        out: Doubles,
+    ) -> None: ...
+
+
+class MatchEchoes(Protocol):
+    """Find the echoes that reflectors at given places explain, by path, direction and power; return their number.
+
+    The number may exceed the space for them. ``across`` (place, axis): a vector across the direction, as long as one
+    standard deviation of the place. ``reflectivity`` (place,) is the expected one. ``extra_m``: standard deviation of
+    paths beside those of the echoes. ``is_flat`` receivers hear echoes from behind. ``chosen``: echoes to match.
+    ``gate``: largest sum of squares, in variances. ``alike``: largest ratio of the power to the expected one; echoes
+    from behind may be weaker. Outputs: ``found`` (3, count), place, echo and emitter of the first matches, and their
+    sums of squares.
+    """
+
+    def __call__(
+        self,
+        places: SeenPlaces,
+        across: Doubles,
+        reflectivity: Doubles,
+        extra_m: float,
+        is_flat: Truths,
+        echoes: HeardEchoes,
+        chosen: Places,
+        gate: float,
+        alike: float,
+        found: Places,
+        out: Doubles,
+    ) -> int: ...
 
 
 class SeePlaces(Protocol):

@@ -200,22 +200,33 @@ def compare_echoes(cell, is_used, gain, evidence, reflectivity, visible, strong,
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def locate_reflector(
-    emitter_m, receiver_m, path_m, axes, deviation, information, nearest_m, outlier, n_rounds, position_m, out
+    sensor_m, ahead, echoes, echo, emitter, added, information, nearest_m, outlier, n_rounds, position_m, out
 ):
     """Locate a reflector by the paths and directions of its echoes."""
     normal, right = np.empty((3, 3)), np.empty(3)
+    axes, deviation = np.empty((len(echo), 2, 3)), np.empty((len(echo), 2))
+    for i in range(len(echo)):
+        here = echoes.receiver[echo[i]]
+        is_behind = _product(position_m - sensor_m[here], ahead[here]) < 0.0
+        for j in range(2):
+            deviation[i, j] = echoes.deviation[echo[i], j]
+            if len(added):
+                deviation[i, j] = np.sqrt(deviation[i, j] ** 2 + added[i, j])
+            axes[i, j] = echoes.axes[echo[i], 1 + j]
+            if is_behind:
+                axes[i, j] -= 2.0 * _product(axes[i, j], ahead[here]) * ahead[here]
     for _ in range(n_rounds):
         normal[:] = 0.0
         right[:] = 0.0
         for i in range(3):
             normal[i, i] = information
-        for echo in range(len(path_m)):
-            away_m, back_m = position_m - emitter_m[echo], position_m - receiver_m[echo]
+        for i in range(len(echo)):
+            away_m, back_m = position_m - sensor_m[emitter[i]], position_m - sensor_m[echoes.receiver[echo[i]]]
             from_m, to_m = max(nearest_m, _length(away_m)), max(nearest_m, _length(back_m))
-            late = (path_m[echo] - from_m - to_m) / deviation[echo, 0]
-            _add_equation((away_m / from_m + back_m / to_m) / deviation[echo, 0], late, outlier, normal, right)
-            for axis in range(1, 3):
-                across = axes[echo, axis] / (to_m * deviation[echo, 1])
+            late = (echoes.path_m[echo[i], emitter[i]] - from_m - to_m) / deviation[i, 0]
+            _add_equation((away_m / from_m + back_m / to_m) / deviation[i, 0], late, outlier, normal, right)
+            for j in range(2):
+                across = axes[i, j] / (to_m * deviation[i, 1])
                 _add_equation(across, -_product(across, back_m), outlier, normal, right)
         _invert(normal, out)
         for i in range(3):
@@ -262,26 +273,29 @@ def _invert(a, out):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def match_echoes(places, echoes, chosen, gate, alike, found, out):
+def match_echoes(places, across, reflectivity, extra_m, is_flat, echoes, chosen, gate, alike, found, out):
     """Find the echoes that reflectors at given places explain, by path, direction and power."""
-    count = 0
+    count, slope_m = 0, np.empty(places.apart_m.shape[1])
     for place in range(len(places.apart_m)):
-        apart_m, slope_m, depth = places.apart_m[place], places.slope_m[place], places.depth[place]
+        apart_m, depth, across_m2 = places.apart_m[place], places.depth[place], _product(across[place], across[place])
+        for sensor in range(len(slope_m)):
+            slope_m[sensor] = _product(places.toward[place, sensor], across[place])
         for echo in chosen:
             here, power = echoes.receiver[echo], echoes.power[echo]
             is_behind, to_m = depth[here] < 0.0, apart_m[here]
-            if is_behind and not places.is_flat[here]:
+            if is_behind and not is_flat[here]:
                 continue
             # For small angles, the chord equals the angle.
-            turned = max(0.0, 2.0 - 2.0 * _product(places.seen[place, here], echoes.direction[echo]))
-            turned /= places.across_m2[place] / (to_m * to_m) + echoes.gate_rad2[echo]
+            turned = max(0.0, 2.0 - 2.0 * _product(places.seen[place, here], echoes.axes[echo, 0]))
+            turned /= across_m2 / (to_m * to_m) + echoes.gate_rad2[echo]
             if not turned < gate:
                 continue
             for emitter in range(len(apart_m)):
                 late_m = echoes.path_m[echo, emitter] - apart_m[emitter] - to_m
-                along_m = slope_m[emitter] + slope_m[here]
-                sum_m2 = along_m * along_m + echoes.gate_m2[echo] + places.extra_m2[place, emitter]
-                distance, expected = turned + late_m * late_m / sum_m2, places.expected[place, here, emitter]
+                along_m, beside_m = slope_m[emitter] + slope_m[here], places.beside_m[place, emitter]
+                sum_m2 = along_m * along_m + echoes.gate_m2[echo] + (beside_m * beside_m + extra_m * extra_m)
+                distance = turned + late_m * late_m / sum_m2
+                expected = reflectivity[place] * places.gain[place, here, emitter]
                 is_alike = power < alike * expected and (is_behind or alike * power > expected)
                 if distance < gate and is_alike:  # False for NaN, where there is no path.
                     if count < len(out):
