@@ -55,8 +55,10 @@ def confirmation(
     have a different echo. Sound over a nearer surface and a wall that only that sensor faces must not explain all of
     these echoes.
     """
+    if not len(place_m):
+        return Confirmation(*np.zeros((2, 0), np.bool_), np.zeros(0, np.int64))
     n_sensors = len(heard.sensor_m)
-    counts = gain > _COUNTS_FROM * gain.max(axis=(1, 2), initial=0.0)[:, None, None]
+    counts = gain > _COUNTS_FROM * gain.max(axis=(1, 2), keepdims=True)
     away_m = place_m[:, None] - heard.sensor_m
     range_m = np.linalg.norm(away_m, axis=2)
     normal = away_m / np.maximum(range_m, NEAREST_M)[..., None]
@@ -71,26 +73,21 @@ def confirmation(
     n_pairs = counts.sum(axis=(1, 2))
     least = min(_N_LEAST, n_sensors)
     needed = np.maximum(np.minimum(n_pairs, _N_SURE), _PART * n_pairs // 1).clip(least)
-    is_behind = _behind(heard, away_m)
-    point = _confirming(heard, np.repeat(place_m[:, None], n_sensors, axis=1), range_m, counts)
-    as_point = _is_enough(heard, point, needed, is_behind)
-    as_wall, wall = np.zeros_like(as_point), np.zeros_like(point)
-    toward = np.zeros_like(place_m)
-    near_m = np.ones(len(place_m))
-    for facing in heard.rows:  # The normal of a wall is the direction from the sensor that faces it.
-        across = normal[:, facing]
-        beyond_m = np.einsum("psi,pi->ps", away_m, across)
-        image_m = heard.sensor_m + 2 * beyond_m[..., None] * across[:, None]
-        found = _confirming(heard, image_m, np.zeros_like(range_m), counts)
-        found &= (depth[:, facing] > _FACING)[:, None, None]
-        as_wall |= _is_enough(heard, found, needed, is_behind)
-        is_better = _n_echoes(found) > _n_echoes(wall)
-        wall[is_better], toward[is_better], near_m[is_better] = (
-            found[is_better],
-            across[is_better],
-            range_m[is_better, facing],
-        )
-    number = np.flatnonzero(_n_echoes(wall) >= np.maximum(least, _n_echoes(point)))
+    is_behind = _behind(heard, range_m, normal, depth)
+    # The normal of a wall is the direction from the sensor that faces it.
+    facing = np.array([*heard.rows], np.int64)
+    across = normal[:, facing].swapaxes(0, 1)
+    beyond_m = np.einsum("psi,wpi->wps", away_m, across)
+    image_m = heard.sensor_m + 2 * beyond_m[..., None] * across[:, :, None]
+    point_m = np.broadcast_to(place_m[:, None], (1, *away_m.shape))
+    found = _confirming(heard, np.concatenate([point_m, image_m]), range_m, counts)
+    found[1:] &= (depth[:, facing] > _FACING).T[..., None, None]
+    is_enough, n_echoes = _is_enough(heard, found, needed, is_behind), _n_echoes(found)
+    as_point, as_wall = is_enough[0], is_enough[1:].any(axis=0)
+    best, every = np.argmax(n_echoes[1:], axis=0), np.arange(len(place_m))
+    point, wall = found[0], found[1 + best, every]
+    number = np.flatnonzero(n_echoes[1 + best, every] >= np.maximum(least, n_echoes[0]))
+    toward, near_m = across[best, every], range_m[every, facing[best]]
     walls = Walls(
         number,
         toward[number],
@@ -109,7 +106,7 @@ def confirmation(
         is_sure &= _is_agreed(heard, best, best & is_free, n_pairs)
         best &= is_sure[:, None, None]
         is_ghost |= over_hidden_walls(heard, place_m, walls, best, hidden, is_ghost)
-    return Confirmation(np.asarray(is_sure & ~is_ghost), as_wall, n_pairs)
+    return Confirmation(np.asarray(is_sure & ~is_ghost), np.asarray(as_wall), n_pairs)
 
 
 def _is_agreed(heard: EchoPaths, confirming: Flags, free: Flags, n_pairs: Numbers) -> Flags:
@@ -119,26 +116,23 @@ def _is_agreed(heard: EchoPaths, confirming: Flags, free: Flags, n_pairs: Number
 
 
 def _n_echoes(confirming: Flags) -> Numbers:
-    """Return the number of echoes that confirm reflectors, each once: (reflector,) int64."""
-    return np.asarray(confirming.any(axis=2).sum(axis=1))
+    """Return the number of echoes that confirm reflectors, each once: (…, reflector) int64."""
+    return np.asarray(confirming.any(axis=-1).sum(axis=-1))
 
 
 def _is_enough(heard: EchoPaths, confirming: Flags, needed: Floats, is_behind: Flags) -> Flags:
     """Return True for reflectors that enough pairs hear, not only from the directions of nearer ones."""
-    n_confirming = np.zeros(is_behind.shape, np.int64)
-    for receiver, rows in heard.rows.items():
-        n_confirming[:, receiver] = confirming[:, rows].any(axis=1).sum(axis=1)
-    return np.asarray((n_confirming.sum(axis=1) >= needed) & ((n_confirming > 0) & ~is_behind).any(axis=1))
+    several = [confirming[..., rows, :].any(axis=-2).sum(axis=-1) for rows in heard.rows.values()]
+    n_confirming = np.stack(several, axis=-1)
+    is_ahead = (n_confirming > 0) & ~is_behind[:, [*heard.rows]]
+    return np.asarray((n_confirming.sum(axis=-1) >= needed) & is_ahead.any(axis=-1))
 
 
-def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
+def _behind(heard: EchoPaths, range_m: Floats, toward: Floats, depth: Floats) -> Flags:
     """Return True where a receiver hears a reflector from the direction of a nearer one: (reflector, receiver).
 
     Sound that a wall and the nearer one reflect arrives from there as well.
     """
-    range_m = np.linalg.norm(away_m, axis=2)
-    toward = away_m / np.maximum(range_m, NEAREST_M)[..., None]
-    depth = np.einsum("psi,si->ps", toward, heard.ahead)
     toward = toward - 2 * np.where(heard.is_flat, np.minimum(depth, 0.0), 0.0)[..., None] * heard.ahead
     cosine = np.einsum("psi,qsi->pqs", toward, toward)
     is_nearer = range_m + _MIN_APART_M < range_m[:, None]
@@ -153,34 +147,38 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
     nearer reflector to the latter. Both imply a wall.
     """
     found = np.zeros(len(place_m), np.bool_)
-    if not len(place_m):
-        return found
     heard_m = sensor_m[facing]
     from_m = np.linalg.norm(place_m[:, None] - heard_m, axis=2)  # (nearer reflector, ghost)
     range_m = np.linalg.norm(place_m - heard_m, axis=1)
     toward = (place_m - heard_m) / np.maximum(range_m, NEAREST_M)[:, None]
     is_nearer = from_m + _MIN_APART_M < range_m
     images_m = np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m, 2 * range_m - range_m[:, None]
-    for image_range_m in images_m:
-        image_m = heard_m + image_range_m[..., None] * toward
-        offset_m = image_m - place_m[:, None]
-        between_m = np.linalg.norm(offset_m, axis=2)
-        normal = offset_m / np.maximum(between_m, NEAREST_M)[..., None]
-        depth_m = np.einsum("pgi,pgi->pg", (image_m + place_m[:, None]) / 2 - heard_m, normal)
-        foot_m = heard_m + depth_m[..., None] * normal
-        nearer, ghost = np.nonzero(is_nearer & (between_m > 2 * _MIN_APART_M) & (depth_m > _MIN_APART_M))
-        wall_m = place_m[:, None] - foot_m[nearer, ghost]
-        off_m = np.abs(np.einsum("wki,ki->wk", wall_m, normal[nearer, ghost]))
-        is_wall = (off_m < _PLANE_M) & (np.linalg.norm(wall_m, axis=2) < _FOOT_M)
-        numbers = np.arange(len(place_m))[:, None]
-        is_wall &= (numbers != nearer) & (numbers != ghost)
-        found[ghost[is_wall.any(axis=0)]] = True
+    image_m = heard_m + np.stack(images_m)[..., None] * toward
+    offset_m = image_m - place_m[:, None]
+    between_m = np.linalg.norm(offset_m, axis=3)
+    normal = offset_m / np.maximum(between_m, NEAREST_M)[..., None]
+    depth_m = np.einsum("wpgi,wpgi->wpg", (image_m + place_m[:, None]) / 2 - heard_m, normal)
+    way, nearer, ghost = np.nonzero(is_nearer & (between_m > 2 * _MIN_APART_M) & (depth_m > _MIN_APART_M))
+    normal = normal[way, nearer, ghost]
+    wall_m = place_m[:, None] - (heard_m[ghost] + depth_m[way, nearer, ghost, None] * normal)
+    off_m = np.abs(np.einsum("wki,ki->wk", wall_m, normal))
+    is_wall = (off_m < _PLANE_M) & (np.linalg.norm(wall_m, axis=2) < _FOOT_M)
+    numbers = np.arange(len(place_m))[:, None]
+    is_wall &= (numbers != nearer) & (numbers != ghost)
+    found[ghost[is_wall.any(axis=0)]] = True
     return found
 
 
 def _confirming(heard: EchoPaths, origin_m: Floats, sent_m: Floats, counts: Flags) -> Flags:
-    """Return the echoes that confirm reflectors, (reflector, echo, emitter), by apparent origins and paths of sound."""
-    found = np.zeros((len(origin_m), *heard.path_m.shape), np.bool_)
-    reflector, emitter, echo = heard.arriving(origin_m, sent_m, _PATH_M, _ANGLE_RAD)
-    found[reflector, echo, emitter] = counts[reflector, heard.receiver[echo], emitter]
+    """Return the echoes that confirm reflectors, (way, reflector, echo, emitter), by apparent origins of their sound.
+
+    Sound of the first way has paths ``sent_m`` to the reflectors, and that of the others comes from mirror images.
+    """
+    found = np.zeros((*origin_m.shape[:2], *heard.path_m.shape), np.bool_)
+    paths_m = np.concatenate([sent_m, np.zeros(((len(origin_m) - 1) * len(sent_m), sent_m.shape[1]))])
+    source, emitter, echo = heard.arriving(
+        origin_m.reshape(len(paths_m), *origin_m.shape[2:]), paths_m, _PATH_M, _ANGLE_RAD
+    )
+    way, reflector = np.divmod(source, len(sent_m))
+    found[way, reflector, echo, emitter] = counts[reflector, heard.receiver[echo], emitter]
     return found
