@@ -12,7 +12,6 @@ from ertis_numba.fusion.explanations import Search
 from ertis_numba.fusion.heights import at_any_height
 from ertis_numba.fusion.known_echoes import KnownEchoes
 from ertis_numba.fusion.locating import Locator, median_of
-from ertis_numba.fusion.overlaps import PredictedEchoes
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
@@ -63,8 +62,8 @@ class Reflectors:
         pulse_m, beam = np.ones((2, len(sensors)))
         for number, receiver in receivers.items():
             pulse_m[number], beam[number] = receiver.pulse_m, receiver.width
-        self._locator = Locator(heard, self._viewers, pulse_m, beam)
-        search = Search(heard, self._viewers, self._locator, grid, bound)
+        self.locator = Locator(heard, self._viewers, pulse_m, beam)
+        search = Search(heard, self._viewers, self.locator, grid, bound)
         found = search.found
         place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
         paths = EchoPaths(
@@ -120,10 +119,6 @@ class Reflectors:
         """Return the emitters to whose calls the echoes of their own sensors are attributed."""
         own = [each.emitter[each.emitter == self._echoes.receiver[each.echo]].tolist() for each in self.located]
         return frozenset(number for each in own for number in each)
-
-    def predicted(self) -> PredictedEchoes:
-        """Return the echoes that the reflectors should cause if all sensors emit."""
-        return self._locator.predicted(self.located)
 
     @property
     def is_sure(self) -> NDArray[np.bool_]:

@@ -56,7 +56,8 @@ def confirmation(
     these echoes.
     """
     if not len(place_m):
-        return Confirmation(*np.zeros((2, 0), np.bool_), np.zeros(0, np.int64))
+        none = np.zeros(0, np.bool_)
+        return Confirmation(none, none, none.astype(np.int64))
     n_sensors = len(heard.sensor_m)
     counts = gain > _COUNTS_FROM * gain.max(axis=(1, 2), keepdims=True)
     away_m = place_m[:, None] - heard.sensor_m

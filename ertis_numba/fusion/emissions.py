@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.noise import EchoFloor
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.association import Reflectors
-from ertis_numba.fusion.overlaps import PredictedEchoes, overlap
 from ertis_numba.fusion.receivers import Receiver
 
 __all__ = [
@@ -54,7 +53,6 @@ _LOST: Final = 10 ** (-5.0 / 10)  # Power relative to an expected echo that othe
 _WITHIN: Final = math.cos(math.radians(4.0))  # Directions in which an echo may appear.
 _NEAR_M: Final = 0.008  # Ranges in which it may appear, …
 _BESIDE_M: Final = 0.03  # … and those with its side lobes.
-_TINY: Final = 1e-30
 
 
 class ExpectedEchoes(NamedTuple):
@@ -166,19 +164,22 @@ def expected_echoes(
     ``late_m`` is the path of sound between the emissions of each receiver and of each emitter that it may hear; echoes
     of ``silent`` emitters hide no others.
     """
-    predicted = reflectors.predicted()
+    predicted = reflectors.locator.predicted(reflectors.located)
+    delay_m = np.full(predicted.power.shape[1:], np.nan)
+    for number, delays_m in late_m.items():
+        delay_m[number, [*delays_m]] = [*delays_m.values()]
+    others = reflectors.locator.disturbance(predicted, delay_m, silent)
     is_heard, is_missed = np.zeros((2, *predicted.power.shape), np.bool_)
     for number, image in images.items():
         receiver, senders = receivers[number], [*late_m[number]]
-        path_m, power = predicted.path_m[:, number, senders], predicted.power[:, number, senders]
-        other = _disturbance(predicted, number, receiver, late_m[number], silent)
-        arrival_m = path_m + np.array([*late_m[number].values()])
+        power, other = predicted.power[:, number, senders], others[:, number, senders]
+        arrival_m = predicted.path_m[:, number, senders] + delay_m[number, senders]
         column = np.searchsorted(image.range_m, arrival_m / 2).clip(0, len(image.range_m) - 1)
         near, beside = (math.ceil(each / float(np.diff(image.range_m[:2])[0])) for each in (_NEAR_M, _BESIDE_M))
         step = (arrival_m / 2 / receiver.step_m).astype(np.int64).clip(0, receiver.n_steps - 1)
         cosine = predicted.direction[:, number] @ receiver.mounting.rotation @ receiver.directions.T
         shown = np.array([image.amplitude[each].max(axis=0, initial=0.0) for each in cosine > _WITHIN])
-        shown = shown.reshape(len(path_m), len(image.range_m))
+        shown = shown.reshape(len(column), len(image.range_m))
         side = _highest(np.broadcast_to(image.amplitude.max(axis=0), shown.shape), column, beside) ** 2 * _SIDE_LOBES
         counts = (column >= beside) & (column < len(image.range_m) - beside) & ~deaf[number][step]
         counts &= (power > _VISIBLE * np.maximum(side, floors[number].lasting ** 2)) & (other < _DISTURBED)
@@ -186,31 +187,6 @@ def expected_echoes(
         is_loud = _highest(shown, column, near) ** 2 > _LOST * (1 - np.sqrt(np.minimum(other, 1.0))) ** 2 * power
         is_heard[:, number, senders], is_missed[:, number, senders] = counts & is_loud, counts & ~is_loud
     return ExpectedEchoes(is_heard, is_missed)
-
-
-def _disturbance(
-    predicted: PredictedEchoes, number: int, receiver: Receiver, late_m: Mapping[int, float], silent: Collection[int]
-) -> Floats:
-    """Return the power of other echoes at expected ones of a receiver, relative to these: (reflector, emitter)."""
-    emitters, delay_m = [*late_m], np.array([*late_m.values()])
-    path_m, power = predicted.path_m[:, number, emitters], predicted.power[:, number, emitters]
-    heard = np.where([each in silent for each in emitters], 0.0, power)
-    here = PredictedEchoes(path_m[:, None], heard[:, None], predicted.direction[:, [number]])
-    of, emitter = (each.ravel() for each in np.indices(path_m.shape))
-    is_other = np.ones((len(of), *path_m.shape), np.bool_)
-    is_other[np.arange(len(of)), of, emitter] = False
-    disturbed = overlap(
-        here,
-        np.zeros(len(of), np.int64),
-        path_m.reshape(-1, 1) + delay_m[emitter, None] - delay_m,
-        here.direction[of, 0],
-        np.maximum(power.ravel(), _TINY),
-        is_other,
-        ahead=receiver.mounting.rotation[None, :, 0],
-        pulse_m=np.array([receiver.pulse_m]),
-        beam=np.array([receiver.width]),
-    )
-    return np.asarray(disturbed.power.sum(axis=1).reshape(path_m.shape))
 
 
 def _highest(rows: NDArray[np.float32], columns: NDArray[np.int64], margin: int) -> Floats:

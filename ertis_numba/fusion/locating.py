@@ -1,7 +1,7 @@
 """Positions of reflectors by least squares, with the errors of echoes that overlap."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -150,6 +150,32 @@ class Locator:
             pulse_m=self._pulse_m,
             beam=self._beam,
         )
+
+    def disturbance(self, predicted: PredictedEchoes, delay_m: Floats, silent: Collection[int]) -> Floats:
+        """Return the power of other echoes at predicted ones, relative to these: (reflector, receiver, emitter).
+
+        ``delay_m`` (receiver, emitter) are the paths of sound between their emissions, NaN for those that a receiver
+        does not hear. Echoes of ``silent`` emitters disturb none.
+        """
+        found = np.zeros_like(predicted.power)
+        of, receiver, emitter = np.nonzero(np.broadcast_to(np.isfinite(delay_m), found.shape))
+        paths_m = predicted.path_m[of, receiver, emitter, None] + delay_m[receiver, emitter, None] - delay_m[receiver]
+        is_other = np.ones((len(of), len(found), found.shape[2]), np.bool_)
+        is_other[np.arange(len(of)), of, emitter] = False
+        heard = predicted.power.copy()
+        heard[..., [*silent]] = 0.0
+        found[of, receiver, emitter] = overlap(
+            predicted._replace(power=heard),
+            receiver,
+            paths_m,
+            predicted.direction[of, receiver],
+            np.maximum(predicted.power[of, receiver, emitter], _TINY),
+            is_other,
+            ahead=self._viewers.ahead,
+            pulse_m=self._pulse_m,
+            beam=self._beam,
+        ).power.sum(axis=1)
+        return found
 
     def predicted(self, found: Sequence[LocatedReflector]) -> PredictedEchoes:
         """Return the echoes that reflectors cause."""
