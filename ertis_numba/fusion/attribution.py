@@ -60,18 +60,20 @@ class _Evidence(NamedTuple):
 
 
 class _Rivalry(NamedTuple):
-    """Hypotheses of a receiver relative to one of them.
+    """Rivals of those hypotheses of a receiver, ``wanted``, that are not mirrored, as in `kernels.ShareEchoes`.
 
-    Where several of them lead to the same place (``same_pixel``, ``same_hypothesis``), they are no rivals: its
-    reflector causes all of their echoes. ``part`` (pixel,) is the power of the echo relative to that of all of these.
+    Where several of them lead to the same place, they are no rivals: its reflector causes all of their echoes. ``part``
+    is the power of the echo relative to that of all of these.
     """
 
+    wanted: Places
+    bounds: Places
     same_pixel: Places
     same_hypothesis: Places
     part: Singles
 
 
-Rivalries: TypeAlias = dict[tuple[int, tuple[tuple[int, bool], ...]], list[_Rivalry]]
+Rivalries: TypeAlias = dict[tuple[int, tuple[tuple[int, bool], ...]], _Rivalry]
 """Rivalries by receiver, and by emitter and side of each hypothesis."""
 
 
@@ -103,7 +105,7 @@ class Attribution:
         }
         self._reduced: dict[frozenset[int], Attribution] = {}
         self._known = {} if rivalries is None else rivalries
-        self._rivalries = {number: self._rivalries_of(number, each) for number, each in self._hypotheses.items()}
+        self._rivalries = {number: self._rivalry_of(number, each) for number, each in self._hypotheses.items()}
         self._own = {pair.receiver: self._own_of(pair) for pair in self._pairs if pair.emitter == pair.receiver}
 
     def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
@@ -145,11 +147,11 @@ class Attribution:
             )
         return self._reduced[unheard]
 
-    def _rivalries_of(self, number: int, hypotheses: Sequence[Hypothesis]) -> list[_Rivalry]:
-        """Return the rivalries of a receiver's hypotheses, which take long to compute."""
+    def _rivalry_of(self, number: int, hypotheses: Sequence[Hypothesis]) -> _Rivalry:
+        """Return the rivalry of a receiver's hypotheses, which takes long to compute."""
         key = number, tuple((each.emitter, each.is_mirrored) for each in hypotheses)
         if key not in self._known:
-            self._known[key] = _rivalries(hypotheses, _SAME_STEPS * self._grid.step_m)
+            self._known[key] = _rivalry(hypotheses, _SAME_STEPS * self._grid.step_m)
         return self._known[key]
 
     def _not_heard(self, evidence: Sequence[_Evidence], reflectivity: Singles) -> frozenset[int]:
@@ -228,35 +230,29 @@ class Attribution:
         self, number: int, image: CoarseImage, around: Singles, confirmed: Singles | None, suppression: float
     ) -> dict[tuple[int, int], Singles]:
         lobe, hypotheses = self._receivers[number].lobe, self._hypotheses[number]
-        power = image.power.reshape(-1)
+        power, rivalry = image.power.reshape(-1), self._rivalries[number]
+        emitters = [hypotheses[each].emitter for each in rivalry.wanted.tolist()]
+        # Sound of an opposite emitter comes only from behind. Its echoes still confirm reflectors.
+        behind = {each.emitter for each in hypotheses}.difference(emitters)
+        found = {(emitter, number): np.zeros_like(power) for emitter in behind}
+        if not emitters:
+            return found
         predicted = np.empty((len(hypotheses), *image.power.shape), dtype=np.float32)
         for each, out in zip(hypotheses, predicted, strict=True):
             self._kernels.predict_echoes(each.begin, each.bounds, each.half_cell, each.half_gain, around, lobe, out)
-        predicted = predicted.reshape(len(hypotheses), len(power))
-        total = predicted.sum(axis=0)
-        found: dict[tuple[int, int], Singles] = {}
-        for index, (each, rivalry) in enumerate(zip(hypotheses, self._rivalries[number], strict=True)):
-            if each.is_mirrored:
-                # Sound of an opposite emitter comes only from behind. Its echoes still confirm reflectors.
-                if (each.emitter, number) not in found:
-                    found[each.emitter, number] = np.zeros_like(power)
-                continue
-            expected = confirmed if each.emitter == number and confirmed is not None else _NONE
-            share = found[each.emitter, number] = np.empty_like(power)
-            self._kernels.share_echoes(
-                predicted,
-                total,
-                rivalry.same_pixel,
-                rivalry.same_hypothesis,
-                power,
-                rivalry.part,
-                expected,
-                index,
-                np.float32(suppression),
-                np.float32(_CONFIRMED),
-                share,
-            )
-        return found
+        shares = np.empty((len(emitters), len(power)), dtype=np.float32)
+        self._kernels.share_echoes(
+            predicted.reshape(len(hypotheses), len(power)),
+            *rivalry[:4],
+            power,
+            rivalry.part,
+            _NONE if confirmed is None else confirmed,
+            emitters.index(number) if number in emitters else -1,
+            np.float32(suppression),
+            np.float32(_CONFIRMED),
+            shares,
+        )
+        return found | {(emitter, number): share for emitter, share in zip(emitters, shares, strict=True)}
 
     def _own_of(self, pair: Pair) -> tuple[Places, Singles]:
         """Return the cell of each pixel, and the gain of the receiver's own call there, 0 outside of the grid."""
@@ -325,10 +321,11 @@ def _limit_sums(shares: Shares) -> None:
             np.multiply(share, factor, out=share)
 
 
-def _rivalries(hypotheses: Sequence[Hypothesis], same_m: float) -> list[_Rivalry]:
-    found = []
-    for each in hypotheses:
-        gain, pixels, others = each.gain.copy(), [], []
+def _rivalry(hypotheses: Sequence[Hypothesis], same_m: float) -> _Rivalry:
+    wanted = np.flatnonzero([not each.is_mirrored for each in hypotheses])
+    parts, bounds, pixels, others = [], [0], [wanted[:0]], [wanted[:0]]
+    for each in (hypotheses[number] for number in wanted.tolist()):
+        gain = each.gain.copy()
         for number, other in enumerate(hypotheses):
             offset_m = other.place_m - each.place_m
             pixel = np.flatnonzero(np.einsum("px,px->p", offset_m, offset_m) < same_m**2)
@@ -336,10 +333,9 @@ def _rivalries(hypotheses: Sequence[Hypothesis], same_m: float) -> list[_Rivalry
                 gain[pixel] += other.gain[pixel]
                 pixels.append(pixel)
                 others.append(np.full(len(pixel), number))
-        part = np.divide(each.gain, gain, out=np.ones_like(gain), where=gain > 0)
-        found.append(_Rivalry(_joined(pixels), _joined(others), part))
-    return found
-
-
-def _joined(places: Sequence[NDArray[np.int64]]) -> Places:
-    return np.concatenate([np.empty(0, np.int64), *places]).astype(np.uint32)
+        parts.append(np.divide(each.gain, gain, out=np.ones_like(gain), where=gain > 0))
+        bounds.append(sum(map(len, pixels)))
+    same = [np.concatenate(each).astype(np.uint32) for each in (pixels, others)]
+    return _Rivalry(
+        wanted.astype(np.uint32), np.array(bounds, np.uint32), same[0], same[1], np.array(parts, np.float32)
+    )

@@ -82,27 +82,30 @@ def predict_echoes(
 
 def share_echoes(
     predicted: Real,
-    total: Real,
+    wanted: Turns,
+    bounds: Turns,
     same_pixel: Turns,
     same_hypothesis: Turns,
     power: Real,
     part: Real,
     confirmed: Real,
-    number: int,
+    own: int,
     suppression: np.float32,
     least_confirmed: np.float32,
     out: Real,
 ) -> None:
-    """Compute the share of each pixel's power that belongs to one hypothesis."""
-    alone = predicted[number]
-    rivals = total - alone
-    np.subtract.at(rivals, same_pixel, predicted[same_hypothesis, same_pixel])
-    np.maximum(rivals, 0, out=rivals)  # Differences of rounding may be negative.
-    out[:] = (1 - suppression * rivals / (power + _TINY)).clip(0, 1)
-    if len(confirmed):
-        is_confirmed = confirmed > least_confirmed * (power + _TINY)
-        np.maximum(out, is_confirmed * (alone / (alone + rivals + _TINY)) ** 3, out=out)
-    out *= part
+    """Compute the shares of each pixel's power that belong to hypotheses."""
+    total = predicted.sum(axis=0)
+    for number, (alone, share) in enumerate(zip(predicted[wanted], out, strict=True)):
+        entries, rivals = slice(bounds[number], bounds[number + 1]), total - alone
+        pixel = same_pixel[entries]
+        np.subtract.at(rivals, pixel, predicted[same_hypothesis[entries], pixel])
+        np.maximum(rivals, 0, out=rivals)  # Differences of rounding may be negative.
+        share[:] = (1 - suppression * rivals / (power + _TINY)).clip(0, 1)
+        if number == own and len(confirmed):
+            is_confirmed = confirmed > least_confirmed * (power + _TINY)
+            np.maximum(share, is_confirmed * (alone / (alone + rivals + _TINY)) ** 3, out=share)
+        np.multiply(share, part[number], out=share)
 
 
 def gather_evidence(

@@ -153,17 +153,18 @@ def arguments(seed=3):
         "share_echoes": (
             (
                 predicted,
-                predicted.sum(axis=0),
+                np.array([0, 1, 3], np.uint32),
+                np.array([0, 20, 150, N_ENTRIES], np.uint32),
                 pixel,
                 np.full(N_ENTRIES, 2, np.uint32),
                 8 * real(N_PIXELS),
-                real(N_PIXELS),
+                real(3, N_PIXELS),
                 4 * real(N_PIXELS),
                 1,
                 one,
                 half,
             ),
-            [(N_PIXELS,)],
+            [(3, N_PIXELS)],
         ),
         "gather_evidence": (
             (*pixels, some(N_ENTRIES, below=N_STEPS), real(N_ENTRIES), real(N_ENTRIES), real(N_PIXELS), real(N_STEPS)),
@@ -247,7 +248,7 @@ def test_find_arrivals_counts_matches_beyond_its_space(load):
 
 @pytest.mark.parametrize("name", ["share_echoes", "add_echoes"])
 def test_fusion_kernels_accept_unknown_shares_and_confirmations(name):
-    place = {"share_echoes": 6, "add_echoes": 7}[name]
+    place = {"share_echoes": 7, "add_echoes": 7}[name]
     given, shapes = arguments()[name]
     given = (*given[:place], np.empty(0, np.float32), *given[place + 1 :])
     found = []

@@ -101,24 +101,26 @@ class PredictEchoes(Protocol):
 
 
 class ShareEchoes(Protocol):
-    """Compute the share (pixel,) of each pixel's power that belongs to hypothesis ``number``.
+    """Compute the shares (share, pixel) of each pixel's power that belong to the hypotheses ``wanted`` (share,).
 
-    With the rivals' predicted power R, the share is ``1 − suppression · R / power``, limited to 0 to 1. With the
-    predicted own power P, a pixel whose reflector other pairs confirm has a share of at least ``(P / (P + R))³``. The
-    share is multiplied by ``part``. ``same_pixel`` and ``same_hypothesis`` (entry,) lead to one place and are no
-    rivals. ``confirmed`` is empty if unknown; ``least_confirmed`` is relative to a pixel.
+    ``predicted`` (hypothesis, pixel) are the powers that all hypotheses predict. With the rivals' predicted power R,
+    the share is ``1 − suppression · R / power``, limited to 0 to 1. With the predicted own power P, a pixel whose
+    reflector other pairs confirm has a share ``own`` of at least ``(P / (P + R))³``. Shares are multiplied by ``part``
+    (share, pixel). ``same_pixel`` and ``same_hypothesis`` (entry,), from ``bounds[share]`` on, lead to one place and
+    are no rivals. ``confirmed`` is empty if unknown; ``least_confirmed`` is relative to a pixel.
     """
 
     def __call__(
         self,
         predicted: Real,
-        total: Real,
+        wanted: Turns,
+        bounds: Turns,
         same_pixel: Turns,
         same_hypothesis: Turns,
         power: Real,
         part: Real,
         confirmed: Real,
-        number: int,
+        own: int,
         suppression: np.float32,
         least_confirmed: np.float32,
         out: Real,

@@ -111,19 +111,43 @@ def predict_echoes(begin, bounds, cell, gain, reflectivity, lobe, out):
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan"})
 def share_echoes(
-    predicted, total, same_pixel, same_hypothesis, power, part, confirmed, number, suppression, least_confirmed, out
+    predicted,
+    wanted,
+    bounds,
+    same_pixel,
+    same_hypothesis,
+    power,
+    part,
+    confirmed,
+    own,
+    suppression,
+    least_confirmed,
+    out,
 ):
-    """Compute the share of each pixel's power that belongs to one hypothesis."""
-    own = predicted[number]
-    for p in range(len(out)):
-        out[p] = total[p] - own[p]
-    for entry in range(len(same_pixel)):
-        out[same_pixel[entry]] -= predicted[same_hypothesis[entry], same_pixel[entry]]
+    """Compute the shares of each pixel's power that belong to hypotheses."""
+    total = predicted[0].copy()
+    for number in range(1, len(predicted)):
+        alone = predicted[number]
+        for p in range(len(total)):
+            total[p] += alone[p]
+    for number in range(len(wanted)):
+        alone, share = predicted[wanted[number]], out[number]
+        for p in range(len(total)):
+            share[p] = total[p] - alone[p]
+        for entry in range(bounds[number], bounds[number + 1]):
+            share[same_pixel[entry]] -= predicted[same_hypothesis[entry], same_pixel[entry]]
+        here = confirmed if number == own else confirmed[:0]
+        _limit_shares(alone, power, here, suppression, least_confirmed, part[number], share)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan"})
+def _limit_shares(alone, power, confirmed, suppression, least_confirmed, part, out):
+    """Turn the power of rivals into shares."""
     for p in range(len(out)):
         rivals = max(out[p], _ZERO)  # Differences of rounding may be negative.
         out[p] = min(max(_ONE - suppression * rivals / (power[p] + _TINY), _ZERO), _ONE)
         if len(confirmed) and confirmed[p] > least_confirmed * (power[p] + _TINY):
-            ratio = own[p] / (own[p] + rivals + _TINY)
+            ratio = alone[p] / (alone[p] + rivals + _TINY)
             out[p] = max(out[p], ratio * ratio * ratio)
         out[p] *= part[p]
 
