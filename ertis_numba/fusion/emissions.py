@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.analysis.noise import EchoFloor
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.association import Reflectors
@@ -169,6 +170,7 @@ def expected_echoes(
     for number, delays_m in late_m.items():
         delay_m[number, [*delays_m]] = [*delays_m.values()]
     others = reflectors.locator.disturbance(predicted, delay_m, silent)
+    find_maxima = kernels.load_fusion().find_maxima
     is_heard, is_missed = np.zeros((2, *predicted.power.shape), np.bool_)
     for number, image in images.items():
         receiver, senders = receivers[number], [*late_m[number]]
@@ -178,21 +180,17 @@ def expected_echoes(
         near, beside = (math.ceil(each / float(np.diff(image.range_m[:2])[0])) for each in (_NEAR_M, _BESIDE_M))
         step = (arrival_m / 2 / receiver.step_m).astype(np.int64).clip(0, receiver.n_steps - 1)
         cosine = predicted.direction[:, number] @ receiver.mounting.rotation @ receiver.directions.T
-        shown = np.array([image.amplitude[each].max(axis=0, initial=0.0) for each in cosine > _WITHIN])
-        shown = shown.reshape(len(column), len(image.range_m))
-        side = _highest(np.broadcast_to(image.amplitude.max(axis=0), shown.shape), column, beside) ** 2 * _SIDE_LOBES
+        is_near, highest = cosine > _WITHIN, np.empty((2, *column.shape))
+        find_maxima(np.ascontiguousarray(image.amplitude), is_near, column, near, beside, highest)
+        shown, side = highest**2
         counts = (column >= beside) & (column < len(image.range_m) - beside) & ~deaf[number][step]
-        counts &= (power > _VISIBLE * np.maximum(side, floors[number].lasting ** 2)) & (other < _DISTURBED)
-        counts &= (cosine > _WITHIN).any(axis=1, keepdims=True)
-        is_loud = _highest(shown, column, near) ** 2 > _LOST * (1 - np.sqrt(np.minimum(other, 1.0))) ** 2 * power
+        counts &= (power > _VISIBLE * np.maximum(side * _SIDE_LOBES, floors[number].lasting ** 2)) & (
+            other < _DISTURBED
+        )
+        counts &= is_near.any(axis=1, keepdims=True)
+        is_loud = shown > _LOST * (1 - np.sqrt(np.minimum(other, 1.0))) ** 2 * power
         is_heard[:, number, senders], is_missed[:, number, senders] = counts & is_loud, counts & ~is_loud
     return ExpectedEchoes(is_heard, is_missed)
-
-
-def _highest(rows: NDArray[np.float32], columns: NDArray[np.int64], margin: int) -> Floats:
-    """Return the highest value around each of several columns of a row: (row, column) float64."""
-    near = (columns[..., None] + np.arange(-margin, margin + 1)).clip(0, rows.shape[1] - 1)
-    return np.asarray(rows[np.arange(len(rows))[:, None, None], near].max(axis=2), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

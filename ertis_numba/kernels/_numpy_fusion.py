@@ -258,6 +258,17 @@ def match_echoes(
     return len(entry)
 
 
+def find_maxima(amplitude: Real, is_near: Truths, column: Places, near: int, beside: int, out: Doubles) -> None:
+    """Compute the highest amplitudes around bins of an image."""
+    rows = (
+        np.where(is_near[:, :, None], amplitude, 0).max(axis=1),
+        np.broadcast_to(amplitude.max(axis=0), (len(column), amplitude.shape[1])),
+    )
+    for values, margin, each in zip(rows, (near, beside), out, strict=True):
+        around = (column[..., None] + np.arange(-margin, margin + 1)).clip(0, amplitude.shape[1] - 1)
+        each[:] = values[np.arange(len(column))[:, None, None], around].max(axis=2)
+
+
 def find_arrivals(
     origin_m: Doubles,
     sent_m: Doubles,
@@ -374,6 +385,7 @@ KERNELS = FusionKernels(
     compare_echoes=compare_echoes,
     locate_reflector=locate_reflector,
     match_echoes=match_echoes,
+    find_maxima=find_maxima,
     find_arrivals=find_arrivals,
     see_places=see_places,
     overlap_echoes=overlap_echoes,

@@ -17,7 +17,7 @@ N_DIRECTIONS, N_STEPS, N_RANGES, N_ENTRIES = 12, 31, 90, 200
 N_PIXELS = N_DIRECTIONS * N_STEPS
 CELLS = 1, 20, 25
 N_CELLS = 500
-DOUBLE = "compare_echoes", "locate_reflector", "match_echoes", "overlap_echoes", "see_places"
+DOUBLE = "compare_echoes", "find_maxima", "locate_reflector", "match_echoes", "overlap_echoes", "see_places"
 COUNTING = "find_arrivals", "match_echoes"  # Their first output holds indices.
 NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
 
@@ -140,6 +140,7 @@ def arguments(seed=3):
     predicted = real(4, N_PIXELS)
     image = N_DIRECTIONS, N_STEPS
     half, one = np.float32(0.5), np.float32(1.2)
+    bins = np.concatenate([[[0, 1, N_RANGES - 1]], draws.integers(0, N_RANGES, (3, 3))])
     return {
         "coarsen_image": (
             (real(N_DIRECTIONS, N_RANGES), first, draws.random(N_STEPS) < 0.2, near, np.float32(0.3), np.float32(0.2)),
@@ -181,6 +182,10 @@ def arguments(seed=3):
         "limit_cells": ((*seen, half), [(N_CELLS,)]),
         "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
         "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),
+        "find_maxima": (
+            (real(N_DIRECTIONS, N_RANGES), draws.random((4, N_DIRECTIONS)) < 0.3, bins, 2, 7),
+            [(2, 4, 3)],
+        ),
         "find_arrivals": (arrivals(draws), [(3, 20)]),
         "see_places": (views(draws), [(9, 3), (9, 3, 3), (9, 3), (9, 3, 3), (9, 3), (9, 3, 3), (9, 3)]),
         "match_echoes": ((*matches(draws), 16.0, 4.0), [(3, 60), (60,)]),

@@ -341,6 +341,18 @@ class SeePlaces(Protocol):
     def __call__(self, place_m: Doubles, sensors: ViewingSensors, out: SeenPlaces) -> None: ...
 
 
+class FindMaxima(Protocol):
+    """Compute the highest amplitudes around bins of an image: ``out`` (2, place, bin).
+
+    The first ones are those of the directions ``is_near`` (place, direction), up to ``near`` ranges beside a bin's
+    ``column`` (place, bin). The second ones are those of all directions, up to ``beside`` ranges beside it.
+    """
+
+    def __call__(
+        self, amplitude: Real, is_near: Truths, column: Places, near: int, beside: int, out: Doubles
+    ) -> None: ...
+
+
 class FindArrivals(Protocol):
     """Find the echoes that fit sound from given places, by path and direction; return their number.
 
@@ -412,6 +424,7 @@ class FusionKernels:
     compare_echoes: CompareEchoes
     locate_reflector: LocateReflector
     match_echoes: MatchEchoes
+    find_maxima: FindMaxima
     find_arrivals: FindArrivals
     see_places: SeePlaces
     overlap_echoes: OverlapEchoes

@@ -329,6 +329,26 @@ def match_echoes(places, across, reflectivity, extra_m, is_flat, echoes, chosen,
     return count
 
 
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan"})
+def find_maxima(amplitude, is_near, column, near, beside, out):
+    """Compute the highest amplitudes around bins of an image."""
+    highest = amplitude[0].copy()
+    for d in range(1, len(amplitude)):
+        row = amplitude[d]
+        for r in range(len(highest)):
+            highest[r] = max(highest[r], row[r])
+    for place in range(column.shape[0]):
+        for b in range(column.shape[1]):
+            here = column[place, b]
+            out[0, place, b] = out[1, place, b] = 0.0
+            for r in range(max(0, here - beside), min(len(highest), here + beside + 1)):
+                out[1, place, b] = max(out[1, place, b], highest[r])
+            for d in range(len(amplitude)):
+                if is_near[place, d]:
+                    for r in range(max(0, here - near), min(len(highest), here + near + 1)):
+                        out[0, place, b] = max(out[0, place, b], amplitude[d, r])
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def find_arrivals(origin_m, sent_m, sensor_m, ahead, is_flat, receiver, direction, path_m, within_m, within_rad, found):
     """Find the echoes that fit sound from given places, by path and direction."""
@@ -472,6 +492,7 @@ KERNELS = FusionKernels(
     compare_echoes=compare_echoes,
     locate_reflector=locate_reflector,
     match_echoes=match_echoes,
+    find_maxima=find_maxima,
     find_arrivals=find_arrivals,
     see_places=see_places,
     overlap_echoes=overlap_echoes,
