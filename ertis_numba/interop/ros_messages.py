@@ -21,7 +21,7 @@ from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._mountings import PLATFORM, Mounting
 from ertis_numba.interop._points import ros_time
 from ertis_numba.motion.flow import MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S
-from ertis_numba.motion.odometry import PlanarPose
+from ertis_numba.motion.planar_pose import PlanarPose
 from ertis_numba.motion.velocity import EgoVelocity
 
 __all__ = [

@@ -6,7 +6,8 @@ from typing import Final
 
 from ertis_numba.frames import Trajectory
 from ertis_numba.fusion.rig import Mountings
-from ertis_numba.motion.odometry import Odometry, PlanarPose
+from ertis_numba.motion.odometry import Odometry
+from ertis_numba.motion.planar_pose import PlanarPose
 from ertis_numba.motion.velocity import EgoVelocity, Item, stamp_of
 
 __all__ = ["LiveOdometry"]

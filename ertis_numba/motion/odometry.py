@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,13 @@ from ertis_numba.frames import Energyscape, Trajectory
 from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow
+from ertis_numba.motion.planar_pose import Doubt, PlanarPose, displacement_of, relative
 from ertis_numba.motion.residuals import twist_of
 from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, time_after_ns, times_ns_of, velocity_of
 
-__all__ = ["Odometry", "PlanarPose"]
+__all__ = ["Odometry"]
 
 Floats = NDArray[np.float64]
-Doubt: TypeAlias = Literal["", "pause", "few echoes", "other motion", "copies"]
 
 # Changes of speed and yaw rate between two groups that the search covers.
 _MAX_CHANGE: Final = np.array([0.6, 0.6, math.radians(60.0)])
@@ -36,58 +36,6 @@ _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
 # 1.8 rad/s².
 _UNKNOWN_SD: Final = np.array([0.5, 0.5, 1.0])
 _ACCELERATION_SD: Final = np.array([1.4, 1.4, 1.8])
-
-
-class PlanarPose(NamedTuple):
-    """Pose of a platform in the plane, relative to its pose at the first group.
-
-    Attributes
-    ----------
-    timestamp_ns : int
-    x_m, y_m, yaw_rad : float
-    covariance : (3, 3) float64
-        Covariance of x, y and yaw since the start, in metres and radians.
-    doubt : {"", "pause", "few echoes", "other motion", "copies"}
-        Reason why the motion is unknown; empty if it was measured. After a pause of more than a second, or if no more
-        echoes match than those of noise or of one moving object (``few echoes``), the last velocity is assumed to have
-        continued, for at most a second. If another motion explains about as much (``other motion``), the more likely
-        one is assumed. Others are standing still, mirrored motion, and the motion of objects. Images that equal those
-        before in every value (``copies``) show no motion.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import ertis_numba as ertis
-    >>> pose = ertis.PlanarPose(0, 0.0, 0.0, np.pi / 2, np.zeros((3, 3)))
-    >>> moved = pose.moved(np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)), 100_000_000)
-    >>> round(moved.x_m, 3), round(moved.y_m, 3)
-    (0.0, 1.0)
-    """
-
-    timestamp_ns: int
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    covariance: Floats
-    doubt: Doubt = ""
-
-    @property
-    def is_measured(self) -> bool:
-        """False if the motion since the last group is unknown."""
-        return not self.doubt
-
-    def moved(self, displacement: Floats, covariance: Floats, timestamp_ns: int, doubt: Doubt = "") -> "PlanarPose":
-        """Return the pose after a displacement in the frame of this pose."""
-        carried, turned = _propagation(self.yaw_rad, displacement)
-        x_m, y_m, turn_rad = (turned @ displacement).tolist()
-        return PlanarPose(
-            timestamp_ns,
-            self.x_m + x_m,
-            self.y_m + y_m,
-            math.remainder(self.yaw_rad + turn_rad, 2 * math.pi),
-            carried @ self.covariance @ carried.T + turned @ covariance @ turned.T,
-            doubt,
-        )
 
 
 class _View(NamedTuple):
@@ -290,7 +238,7 @@ class Odometry:
         age_s = math.inf if self._twist_ns is None else (timestamp_ns - self._twist_ns) / 1e9
         if found is None:
             doubt: Doubt = "copies" if has_copies else "pause" if time_s > MAX_TIME_S else "few echoes"
-            way = _displacement(self._twist, max(0.0, min(time_s, MAX_TIME_S, MAX_TIME_S + time_s - age_s)))
+            way = displacement_of(self._twist, max(0.0, min(time_s, MAX_TIME_S, MAX_TIME_S + time_s - age_s)))
             deviation = np.minimum(_UNKNOWN_SD, _ACCELERATION_SD * age_s) * time_s
         else:
             doubt, way, deviation = "other motion", found.displacement, np.sqrt(np.diag(found.covariance))
@@ -308,9 +256,9 @@ class Odometry:
         if last is None:
             return None
         if last.twist is None:
-            suspects = [_displacement(twist, time_s) for twist in self._suspects]
+            suspects = [displacement_of(twist, time_s) for twist in self._suspects]
             return _significant(fit_flow(last.echoes, echoes, self._sensors, time_s, suspects=suspects))
-        start = _displacement(last.twist, time_s)
+        start = displacement_of(last.twist, time_s)
         near = fit_flow(
             last.echoes,
             echoes,
@@ -333,7 +281,7 @@ class Odometry:
         step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns)
         keyframe = self._keyframe
         if keyframe is not None:
-            expected = _relative(keyframe.pose, step)
+            expected = relative(keyframe.pose, step)
             if math.hypot(*expected[:2]) < _KEYFRAME_M and abs(expected[2]) < _KEYFRAME_RAD:
                 # A view keeps the twist that it had when it was located, so that errors of twists add up to nothing.
                 fit = fit_flow(
@@ -365,14 +313,6 @@ def _is_copy(item: Item, last: Item | None) -> bool:
     )
 
 
-def _propagation(yaw_rad: float, displacement: Floats) -> tuple[Floats, Floats]:
-    """Return derivatives of a moved pose by the pose at a yaw, and by the displacement: two (3, 3) float64."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    x_m, y_m, _ = (turned @ displacement).tolist()
-    return np.array([[1.0, 0.0, -y_m], [0.0, 1.0, x_m], [0.0, 0.0, 1.0]]), turned
-
-
 def _significant(fit: FlowFit | None) -> FlowFit | None:
     """Return a fit if unrelated echoes do not match as well by accident."""
     return fit if fit is not None and fit.is_significant else None
@@ -398,18 +338,3 @@ def _begins_with(sensors: tuple[MountedSensor, ...], others: tuple[MountedSensor
         and np.array_equal(one.rotation, other.rotation)
         for one, other in zip(sensors, others, strict=False)
     )
-
-
-def _displacement(twist: Floats, time_s: float) -> Floats:
-    """Return the displacement by a constant velocity in the frame of the platform: (3,) float64."""
-    x, y, turn = (twist * time_s).tolist()
-    shrink = float(np.sinc(turn / 2 / math.pi))
-    c, s = math.cos(turn / 2) * shrink, math.sin(turn / 2) * shrink
-    return np.array([c * x - s * y, s * x + c * y, turn])
-
-
-def _relative(origin: PlanarPose, pose: PlanarPose) -> Floats:
-    """Return a pose in the frame of another one: (3,) float64."""
-    c, s = math.cos(origin.yaw_rad), math.sin(origin.yaw_rad)
-    x, y = pose.x_m - origin.x_m, pose.y_m - origin.y_m
-    return np.array([c * x + s * y, c * y - s * x, math.remainder(pose.yaw_rad - origin.yaw_rad, 2 * math.pi)])

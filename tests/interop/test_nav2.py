@@ -15,7 +15,7 @@ import pytest
 from ertis_numba.frames import PointCloud, Stamp
 from ertis_numba.interop.ros_messages import odometry_message, odometry_transform
 from ertis_numba.interop.scans import scan_message
-from ertis_numba.motion.odometry import PlanarPose
+from ertis_numba.motion.planar_pose import PlanarPose
 from tests.files import image
 
 yaml = pytest.importorskip("yaml")

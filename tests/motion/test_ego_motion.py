@@ -15,7 +15,7 @@ from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import fit_flow
-from ertis_numba.motion.odometry import PlanarPose
+from ertis_numba.motion.planar_pose import PlanarPose
 from ertis_numba.settings import Array
 
 MOUNTINGS = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
