@@ -89,6 +89,12 @@ class Receiver:
             and np.array_equal(image.range_m, self._range_m)
         )
 
+    def blind_m(self, deaf: NDArray[np.bool_], mounting: MountedSensor) -> float:
+        """Return the largest horizontal distance from the origin of a place too near to the image of a sensor."""
+        first = deaf[(self._range_m / self.step_m).astype(np.int64)].argmin()
+        edge_m = self._range_m[first] * self.directions @ mounting.rotation.T + mounting.translation_m
+        return float(np.hypot(edge_m[:, 0], edge_m[:, 1]).max())
+
     def coarse(self, image: Energyscape, deaf: NDArray[np.bool_]) -> CoarseImage:
         """Return the powers of an image, with direct sound, which hides echoes, at the steps ``deaf``."""
         amplitude = np.ascontiguousarray(image.amplitude, dtype=np.float32)

@@ -1,5 +1,6 @@
 """Tables of fusion: receivers, pairs and hypotheses of all sensors of a platform."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -398,11 +399,22 @@ class FusionTables:
             deaf |= np.abs(range_m - (apart_m + delay_m) / 2) <= _DIRECT_SOUND_M
         return np.asarray(deaf)
 
+    @functools.cached_property
+    def _blind_m(self) -> float:
+        """Distance from the origin within which reflectors may be nearer to a sensor than its image."""
+        # All images of a file have the same settings, so sensors without an image so far count like the first one.
+        first = next(iter(self._receivers))
+        known = [number if number in self._receivers else first for number in range(len(self._sensors))]
+        return max(
+            self._receivers[number].blind_m(self._deaf[number], sensor)
+            for number, sensor in zip(known, self._sensors, strict=True)
+        )
+
     def _fused_settings(self, settings: Settings) -> Settings:
         limit_deg = 180.0 - 180.0 / self.grid.n_azimuths
         limits = {
             "azimuth_limits_deg": (-limit_deg, limit_deg),
-            "range_m": (float(self.grid.range_m[0]), float(self.grid.range_m[-1])),
+            "range_m": (max(self._blind_m, float(self.grid.range_m[0])), float(self.grid.range_m[-1])),
         }
         # Settings hold at most 1000 directions, so those of a three-dimensional image are named by their count only.
         kind = "2d" if self.grid.is_planar else "3d"

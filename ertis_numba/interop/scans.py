@@ -38,6 +38,9 @@ def scan_message(
     else:
         range_m, level_dbfs = nearest_echo(image, min_level_db=min_level_db, floor_dbfs=floor_dbfs)
         ranges_m, levels_dbfs = range_m[nearest], level_dbfs[nearest]
+    # Nearer than the first range of the settings, not all directions are observed. Receivers discard readings up to
+    # `range_min`, which therefore stays below all of them.
+    nearest_m = np.nextafter(ranges_m.min(), 0.0, dtype=np.float32)
     return {
         "header": header(image.stamp),
         "angle_min": float(angle_rad[0]),
@@ -45,7 +48,7 @@ def scan_message(
         "angle_increment": float(angle_rad[1] - angle_rad[0]),
         "time_increment": 0.0,  # One call serves all angles.
         "scan_time": 0.0,
-        "range_min": float(image.range_m[0]),
+        "range_min": min(max(float(image.range_m[0]), image.settings.processing.range_m[0]), float(nearest_m)),
         "range_max": float(image.range_m[-1]),
         "ranges": ranges_m.tolist(),
         "intensities": levels_dbfs.tolist(),
