@@ -13,7 +13,13 @@ from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.emissions import PulseEvidence, best_evidence, is_much_better
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
-from ertis_numba.fusion.rig import USUAL_DIAMETER_M, Mountings, emitter_diameter_m, mounted_sensors
+from ertis_numba.fusion.rig import (
+    USUAL_DIAMETER_M,
+    Mountings,
+    emitter_diameter_m,
+    mounted_sensors,
+    require_common_reach,
+)
 from ertis_numba.fusion.tables import FusionTables, PulseReflectors
 from ertis_numba.geometry import require_places
 from ertis_numba.settings import MAX_EMITTER_M, Array
@@ -225,7 +231,8 @@ class Fuser:
         ------
         ArgumentError
             There is no image, two images of the same sensor, an image without a mounting, a mixture of planar and
-            other images, or an image whose array observes no places: see `ertis_numba.geometry.observable_angles`.
+            other images, an image whose array observes no places (see `ertis_numba.geometry.observable_angles`), or a
+            mounting so far from all others that no reflector is within the range of two sensors.
         DataError
             The images are not from the same pulse.
         """
@@ -387,6 +394,7 @@ class Fuser:
             raise ArgumentError(
                 f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; use a larger step"
             )
+        require_common_reach(self._mountings, max(float(image.range_m[-1]) for image in group.values()))
         # Of all sensors: one without an image now may reach farthest in a later group.
         farthest_m = max(float(np.linalg.norm(sensor.translation_m[:2])) for sensor in self._mountings)
         last_m = farthest_m + max(float(image.range_m[-1]) for image in group.values())

@@ -17,7 +17,15 @@ from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Settings
 
-__all__ = ["USUAL_DIAMETER_M", "Emitters", "MountedSensor", "Mountings", "emitter_diameter_m", "mounted_sensors"]
+__all__ = [
+    "USUAL_DIAMETER_M",
+    "Emitters",
+    "MountedSensor",
+    "Mountings",
+    "emitter_diameter_m",
+    "mounted_sensors",
+    "require_common_reach",
+]
 
 Floats = NDArray[np.float64]
 Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -25,6 +33,7 @@ Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 
 USUAL_DIAMETER_M: Final = 0.012
 """Diameter of an emitter whose settings and layout state none."""
+_LARGEST_M: Final = 2.0  # Usual distances of sensors on a platform are shorter.
 _N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averaged
 _NEAREST_M = kernels.SPREADING_M
 _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
@@ -65,6 +74,27 @@ def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
             MountedSensor(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix())
         )
     return tuple(sensors)
+
+
+def require_common_reach(sensors: Sequence[MountedSensor], last_m: float) -> None:
+    """Raise ArgumentError if a sensor is so far from all others that no reflector is within the range of two."""
+    if len(sensors) < 2:
+        return
+    places_m = np.array([sensor.translation_m for sensor in sensors])
+    apart_m = np.linalg.norm(places_m[:, None] - places_m, axis=2) + np.diag(np.full(len(sensors), np.inf))
+    number = int(apart_m.min(axis=1).argmax())
+    nearest_m = float(apart_m[number].min())
+    # A call that one sensor emits and another receives has travelled at least the distance between both.
+    if nearest_m <= 2 * last_m:
+        return
+    one, other = (sensors[each].name for each in sorted((number, int(apart_m[number].argmin()))))
+    unit, factor = ("centimetres", 100) if nearest_m < _LARGEST_M * 100 else ("millimetres", 1000)
+    likely = f"; if the file states {unit}, divide them by {factor}" if nearest_m < _LARGEST_M * factor else ""
+    raise ArgumentError(
+        f"sensors {one!r} and {other!r} are mounted {round(nearest_m, 2):g} m apart, but images reach {last_m:.3g} m, "
+        "so both observe no common reflector; correct the positions of the mountings, which are in metres"
+        f"{likely}, or use sensors of one platform"
+    )
 
 
 def emitter_diameter_m(settings: Settings, given_m: float | None = None) -> float:

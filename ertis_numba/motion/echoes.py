@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.points import EchoPointExtractor
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.rig import MountedSensor, emitter_diameter_m
+from ertis_numba.fusion.rig import MountedSensor, emitter_diameter_m, require_common_reach
 from ertis_numba.geometry import Grid, microphones, require_places
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array, Call
@@ -76,6 +76,7 @@ class EchoExtractor:
 
     def __call__(self, group: Mapping[str, Energyscape | PointCloud]) -> GroupEchoes:
         """Return the echoes of a group of images or point clouds, by sensor."""
+        require_common_reach(self._mounted, max(item.settings.processing.range_m[1] for item in group.values()))
         parts = [self._echoes(item, group.keys()) for item in group.values()]
         echoes = GroupEchoes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         is_foreign = np.zeros(len(echoes.level), dtype=np.bool_)
