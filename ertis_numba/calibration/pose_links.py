@@ -77,12 +77,12 @@ def _emitter_points(waves: Sequence[Wave]) -> list[NDArray[np.float64]]:
     return found
 
 
-def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) -> list[RigidLink]:
+def candidate_links(first: WavesOfSensor, second: WavesOfSensor) -> list[RigidLink]:
     """Return transforms from the second sensor to the first that many reflectors agree with, best first."""
     # Three pairs with equal distances yield a transform (W. Kabsch, 1976); agreement selects (Fischler and Bolles,
     # 1981).
     pairs = _pairs(first, second)
-    triples = _triples(pairs, np.random.default_rng(seed))
+    triples = _triples(pairs, np.random.default_rng(0))
     if not len(triples):
         return []
     rotation, shift_m = _kabsch(pairs.first_m[triples], pairs.second_m[triples], np.ones(triples.shape))

@@ -96,13 +96,10 @@ def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
     return 2 * math.pi / period_rise * np.log1p(time_s * period_rise / period_s)
 
 
-def call_spectrum(
-    call: Call, settings: Settings, *, n_fft: int, decimation: int | None = None
-) -> NDArray[np.complex128]:
+def call_spectrum(call: Call, settings: Settings, *, n_fft: int) -> NDArray[np.complex128]:
     """Return the one-sided spectrum of a call in decimated signals: (bin,); ``n_fft`` is at least the call's length."""
     # At the decimated rate, a short call without ramps would alias.
-    decimation = settings.decimation if decimation is None else decimation
-    return _call_spectrum(call, settings.recording.sample_rate_hz, n_fft, decimation)
+    return _call_spectrum(call, settings.recording.sample_rate_hz, n_fft, settings.decimation)
 
 
 def _call_spectrum(call: Call, sample_rate_hz: float, n_fft: int, decimation: int) -> NDArray[np.complex128]:

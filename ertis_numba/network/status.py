@@ -34,8 +34,8 @@ class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
 class Latencies:
     """Collector of recent durations."""
 
-    def __init__(self, size: int = 1024) -> None:
-        self._times_ms: deque[float] = deque(maxlen=size)
+    def __init__(self) -> None:
+        self._times_ms: deque[float] = deque(maxlen=1024)
 
     def add(self, time_ms: float) -> None:
         """Add a duration."""

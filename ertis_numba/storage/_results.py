@@ -12,7 +12,7 @@ from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.atomic_files import check_target
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import AcousticMap, Energyscape, Trajectory
-from ertis_numba.geometry import mounting, mounting as mounted, self_contained
+from ertis_numba.geometry import mounting as mounted, self_contained
 from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._poses import POSE_SIZES, read_poses, write_poses
 from ertis_numba.storage._reader import FileReader
@@ -204,7 +204,7 @@ def provenance(readers: Sequence[RecordingReader]) -> dict[str, str]:
 def recorded_mountings(readers: Sequence[RecordingReader]) -> dict[str, dict[str, NDArray[np.float64]]]:
     """Return the known mountings by name of the sensor, in the form of `ertis_numba.geometry.mounting`."""
     return {
-        reader.sensor: mounting(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
+        reader.sensor: mounted(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
         for reader in readers
         if reader.translation_m is not None and reader.rotation_xyzw is not None
     }

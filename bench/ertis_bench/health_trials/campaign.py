@@ -10,10 +10,8 @@ from ertis_bench.health_trials.faults import FAULTS, ArrayFault
 from ertis_bench.health_trials.scenes import base, healthy
 from ertis_numba.analysis.health import Health, health
 
-__all__ = ["MIN_SHARE", "false_alarms", "named", "run"]
+__all__ = ["false_alarms", "named", "run"]
 
-MIN_SHARE = 0.95
-"""Smallest share of trials in which an observable fault must be named."""
 _SHORT, _LONG = (40, 1), (1000, 30)
 
 

@@ -21,7 +21,6 @@ ERTIS: Final = (sys.executable, "-m", "ertis_cli")
 _WAIT_S: Final = 60.0  # time limit for events that need no further action
 _MARK: Final = "ERTIS_BENCH_MARK"
 _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
-_TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 Event = dict[str, Any]
 
 
@@ -140,15 +139,6 @@ class JsonLinesProcess:
         except (OSError, IndexError):
             return 0
         return int(pages) * _PAGE_BYTES
-
-    @staticmethod
-    def cpu_s_of(pid: int) -> float:
-        """Return the processor time of a process without its children in seconds, or 0 if it is unknown."""
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_text("ascii").rpartition(")")[2].split()
-        except OSError:
-            return 0.0
-        return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
     def __enter__(self) -> Self:
         return self
