@@ -20,15 +20,17 @@ from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor, Wall
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.render import Simulator
-from tests.scenes import line_array
+from tests.scenes import line_array, only
 
 LAYOUT = load_layout("eRTIS_v3D1")
 SENSOR = Sensor(emitter=Emitter(level_db=-6.0), electronics=Electronics(noise_dbfs=-55.0))
 
 
 def rendered(sensor=SENSOR, **scene):
-    return Simulator(Scene(sensors=(sensor,), **scene)).render(0)
+    """Render a measurement with every effect on, because plans take longer than renderings."""
+    return Simulator(Scene(sensors=(sensor,), **scene), plan=only(*EFFECTS)).render(0)
 
 
 def echo(azimuth_deg=20.0, range_m=1.0, **more):

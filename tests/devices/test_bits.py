@@ -23,8 +23,10 @@ from ertis_numba.devices.bits import BitCheck
 from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import load_scene
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.modulator import Modulator
 from ertis_numba.simulation.render import Simulator
+from tests.scenes import only
 
 REAL = np.fromfile(importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin"), dtype="<u4")
 SYNTHETIC = Path(__file__).parents[2] / "data" / "synthetic"
@@ -128,7 +130,7 @@ def test_simulated_scenes_are_accepted_as_pdm(path):
     scene = load_scene(path)
     first = scene.sensors[0]
     sensors = (first.replace(recording=Recording(n_samples=2 * SHORT)), *scene.sensors[1:])
-    simulator = Simulator(scene.replace(sensors=sensors, count=1))  # effects are planned for all measurements
+    simulator = Simulator(scene.replace(sensors=sensors, count=1), plan=only(*EFFECTS))
     assert verdict(simulator.render().data) is None
 
 

@@ -23,11 +23,13 @@ from ertis_numba.fusion.tables import FusionTables
 from ertis_numba.geometry.air import absorption_db_m
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.viewer._choices import Choices
 from ertis_numba.viewer._scene import ViewedScene
 from ertis_numba.viewer._shapes import Pose, ReceivedImage
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
+from tests.scenes import only
 
 YAWS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
 PLACES_M = ((1.5, 0.3), (1.1, 1.0), (-0.4, 1.6), (-1.7, -0.9), (0.5, -1.2))
@@ -275,10 +277,10 @@ SCENES = (1000, 1001, 1002, 1003)
 @functools.cache
 def recorded(seed, diameter_m):
     """Images of a random platform scene, with the mountings and places of its reflectors."""
-    made, group = platform_scene(seed, random_reflectors(seed), diameter_m), []
+    made, group, plan = platform_scene(seed, random_reflectors(seed), diameter_m), [], only(*EFFECTS)
     for sensor in made.sensors:
         with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
-            group.append(pipeline.process(ertis.render(made, sensor=sensor.name)))
+            group.append(pipeline.process(ertis.Simulator(made, sensor=sensor.name, plan=plan).render()))
     return group, {sensor.name: (sensor.position_m, sensor.quaternion()) for sensor in made.sensors}
 
 

@@ -88,7 +88,7 @@ def record(array: FaultyArray, seed: int, count: int, *, noise_dbfs: float = -50
         emitter=Emitter(level_db=_LEVEL_DB),
         electronics=Electronics(noise_dbfs=noise_dbfs, dead_channels=array.dead),
     )
-    made = []
+    plan, made = None, []
     gc.collect()  # The renderers of former arrays refer to themselves, and hold 40 MB each.
     for number in range(count):
         reflector = Point(
@@ -97,7 +97,10 @@ def record(array: FaultyArray, seed: int, count: int, *, noise_dbfs: float = -50
             range_m=float(rng.uniform(*_RANGE_M)),
             strength_db=_STRENGTH_DB,
         )
-        found = Simulator(Scene(seed=1000 * seed + number, points=(reflector,), sensors=(sensor,))).render(0)
+        scene = Scene(seed=1000 * seed + number, points=(reflector,), sensors=(sensor,))
+        simulator = Simulator(scene, plan=plan)
+        plan = simulator.plan  # A reflector elsewhere needs the same effects, and plans take longer than renderings.
+        found = simulator.render(0)
         words = found.data.copy()
         for channel in array.inverted:
             words ^= words.dtype.type(1 << channel)
