@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from tests.pages import ROOT, commands_in, page
+from tests.pages import ROOT, command_program, commands_in, forking, page
 
 BLOCKED = """
 import sys
@@ -45,26 +45,27 @@ assert "numba" not in sys.modules
 """
 
 
-def run(place, *words):
-    environment = os.environ | {"PYTHONPATH": f"{place / 'blocked'}", "MPLCONFIGDIR": str(place)}
-    return subprocess.run(words, cwd=place, env=environment, capture_output=True, text=True, check=False, timeout=120)
+@pytest.fixture(scope="module")
+def run_forked(tmp_path_factory):
+    """Run programs that cannot import Numba in the folder of the module."""
+    preload = ("numpy", "scipy.fft", "scipy.spatial", "h5py", "click", "msgspec")
+    folder = tmp_path_factory.mktemp("without_numba")
+    with forking(folder, tmp_path_factory.mktemp("output"), preload, unloaded=("numba", "llvmlite")) as run_forked:
+        yield folder, lambda program: run_forked(BLOCKED + program)
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def place(run_forked):
     """Return a folder with the results of all commands, and the texts that they printed to stderr."""
-    place = tmp_path_factory.mktemp("without_numba")
-    (place / "blocked").mkdir()
-    (place / "blocked" / "sitecustomize.py").write_text(BLOCKED)
-    ertis_cli = [sys.executable, "-m", "ertis_cli"]
+    folder, run = run_forked
     texts = {}
     for line in ("ertis example reflectors", *COMMANDS.strip().splitlines()):
-        done = run(place, *ertis_cli, *line.split()[1:])
-        assert done.returncode == 0, done.stderr
+        done = run(command_program(line.split()[1:]))
+        assert done.code == 0, done.stderr
         texts[line] = done.stderr
-    done = run(place, sys.executable, "-c", POINTS)
-    assert done.returncode == 0, done.stderr
-    return place, texts
+    done = run(POINTS)
+    assert done.code == 0, done.stderr
+    return folder, texts
 
 
 def test_commands_without_numba_process_a_scene_as_compiled_kernels_do(place):
@@ -104,16 +105,17 @@ def test_each_command_that_chooses_numpy_by_itself_says_so_once(place):
         ("bench paper", "'ertis bench' needs Numba"),
     ],
 )
-def test_a_command_that_needs_numba_ends_with_one_line(place, line, message):
-    done = run(place[0], sys.executable, "-m", "ertis_cli", *line.split())
-    assert done.returncode == 1
+@pytest.mark.usefixtures("place")
+def test_a_command_that_needs_numba_ends_with_one_line(run_forked, line, message):
+    done = run_forked[1](command_program(line.split()))
+    assert done.code == 1
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
     assert "install it with 'pip install numba'" in done.stderr
 
 
-def test_doctor_notes_a_missing_numba(place):
-    done = run(place[0], sys.executable, "-m", "ertis_cli", "doctor", "--json")
+def test_doctor_notes_a_missing_numba(run_forked):
+    done = run_forked[1](command_program(["doctor", "--json"]))
     found = {each["check"]: each for each in json.loads(done.stdout)["findings"]}
     assert found["Numba"]["state"] == "note"
     assert found["processing"]["state"] == "good"

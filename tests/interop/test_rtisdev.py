@@ -177,7 +177,7 @@ def test_fast_method_predicts_its_difference_from_the_exact_one(fast, preset):
     ids=["far", "near in a long image", "near", "nearest"],
 )
 def test_fast_method_predicts_its_difference_for_weak_and_near_echoes(fast, limits, range_m, strength_db):
-    settings = prepared(directions=91, minRange=limits[0], maxRange=limits[1], cleanEnable=False)
+    settings = prepared(directions=31, minRange=limits[0], maxRange=limits[1], cleanEnable=False)
     loud_db, weak_db = announced(fast.text)
     words = render(Scene(points=(Point(range_m=range_m, azimuth_deg=15, strength_db=strength_db),))).data.reshape(-1)
     got = rtiscuda.processing(words, 1, settings.nDirections, settings.nspses, "test")
