@@ -94,6 +94,7 @@ BEAMFORMERS = [
 ]
 
 
+@pytest.mark.usefixtures("sound_unchecked")
 @pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.ErrorBudgetWarning")  # Budgets hold for echoes.
 @pytest.mark.parametrize(("beamformer", "weighting"), BEAMFORMERS)
 def test_every_beamformer_lists_the_reflectors_and_no_noise(beamformer, weighting):

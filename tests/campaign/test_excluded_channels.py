@@ -18,6 +18,8 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_recordi
 from tests.campaigns import run_here
 from tests.files import SMALL, noise
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 PLACE = {"left": ((0.0, 0.1, 0.0), (0.0, 0.0, 0.0, 1.0)), "right": ((0.0, -0.1, 0.0), (0.0, 0.0, 0.0, 1.0))}
 
 

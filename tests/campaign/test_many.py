@@ -27,6 +27,8 @@ from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import InlinePool, ended, names_in, outcomes, run_here, write_recordings
 from tests.files import SMALL, line, noise
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 RANGE_M = (0.5, 0.8)
 FEW_MICS = line(8, 8)
 
@@ -100,6 +102,7 @@ def test_files_equal_those_of_single_recordings(runs, out, monkeypatch):
 
 
 def test_single_recording_is_reported_like_many(runs, out, monkeypatch):
+    monkeypatch.undo()  # This test needs the checks.
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, explain=True, verify=True))
     arguments = [str(runs / "a.h5"), "--range", "0.5:0.8", "--explain", "--verify", "--json"]
     single = json.loads(CliRunner().invoke(cli, ["process", *arguments]).stdout)
@@ -262,6 +265,7 @@ def test_sensors_of_a_recording_share_its_output(tmp_path, out, monkeypatch):
 
 
 def test_faulty_microphones_are_reported_or_refused(tmp_path, out, monkeypatch):
+    monkeypatch.undo()  # This test needs the checks.
     measurements = noise(count=2)
     for measurement in measurements:
         measurement.data[:] &= np.uint32(0xFFFFFFFE)

@@ -21,6 +21,8 @@ from tests.cases import SHORT, noise
 from tests.files import noise as many_noise
 from tests.pages import ROOT, path_of
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 CPU = kernels.load("cpu")
 MANY = SHORT.replace(processing=SHORT.processing.replace(directions="3d:2000"), accuracy=Accuracy(max_error_db=-35.0))
 

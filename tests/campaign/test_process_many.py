@@ -17,6 +17,8 @@ from ertis_numba.pipeline import verification
 from tests.campaigns import InlinePool, names_in, write_recordings
 from tests.files import line
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
 
 

@@ -18,6 +18,8 @@ from tests.cases import LINE_8, SHORT, noise
 from tests.hard_cases.echoes import echo_words
 from tests.hard_cases.tuned import tuned
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 NEAR = SHORT.replace(processing=Processing(directions="2d:3", range_m=(0.1, 1.0), wavefront="spherical"))
 LINE = Array(layout="line", positions_m=LINE_8, word_bits=8)
 

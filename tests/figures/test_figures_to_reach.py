@@ -105,12 +105,13 @@ def real(request):
     settings = Settings.from_preset("default_25_50")
     settings = settings.replace(processing=settings.processing.replace(directions=request.param, wavefront="plane"))
     measurement = Measurement(np.fromfile(RAW, dtype="<u4"), settings)
-    axes = ertis.Pipeline(settings)
+    axes = ertis.Pipeline(settings, predict=False)
     some = np.unique(np.linspace(0, len(axes.grid) - 1, 24).astype(int))
     directions = unit_vectors(axes.grid.azimuth_rad[some], axes.grid.elevation_rad[some])
     return measurement, some, reference.exact(measurement.data, settings, directions, axes.range_m)
 
 
+@pytest.mark.usefixtures("sound_unchecked")
 @pytest.mark.parametrize("budget", ["draft", "standard", "fine", "exact"])
 def test_images_of_the_real_measurement_keep_their_budget(real, budget):
     """Plans without knowledge of the signals keep their budget; 'standard' is that of the default settings."""

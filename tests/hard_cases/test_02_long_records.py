@@ -17,6 +17,8 @@ from ertis_numba.storage import write_recording
 from tests import reference
 from tests.hard_cases.tuned import tuned
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 N_SAMPLES = 2**24
 N_NOISE = 40_960
 PAIR = Array(layout="pair", positions_m=((0.0, -0.02, 0.0), (0.0, 0.02, 0.0)), word_bits=8)

@@ -18,6 +18,8 @@ from tests.cases import noise
 from tests.hard_cases.tuned import chain_of
 from tests.scenes import only, scene_of
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 LOUDEST_DB = -6.0  # level of the direct sound in the microphone nearest to the emitter
 DIRECT_DB = -46.0  # reaches LOUDEST_DB at that microphone's distance of 1 cm
 SHORT = Settings(

@@ -21,6 +21,8 @@ from tests.hard_cases.forced import EIGHT, image_of
 from tests.hard_cases.tuned import tuned
 from tests.scenes import EAR, SENSOR, heard, scene_of
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 ONE = Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8)
 TWO_IN_ONE_PLACE = Array(layout="pair", positions_m=((0.01, 0.02, -0.03),) * 2, word_bits=8)
 

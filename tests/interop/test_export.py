@@ -21,6 +21,8 @@ from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, echoes, image, noise
 from tests.pages import page, run_code_here
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 ROOT = Path(__file__).parents[2]
 PAGE = page("export")
 MOUNTED = {"left": ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "right": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}

@@ -14,6 +14,8 @@ from ertis_numba.pipeline import Pipeline, pipeline as pipelines
 from ertis_numba.settings import Air
 from tests.cases import SHORT, noise
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 MEASUREMENTS = [replace(noise(SHORT, seed), stamp=Stamp(sequence=seed)) for seed in range(5)]
 
 

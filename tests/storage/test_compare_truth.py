@@ -14,6 +14,8 @@ import ertis_numba as ertis
 from ertis_numba.analysis.compare_places import positions_m
 from ertis_numba.storage import read_map_truth, write_recording
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 POSTS_M = ((1.6, 0.4, 0.4), (1.2, -0.5, 0.4))
 _SENSOR = """
 [[sensors]]

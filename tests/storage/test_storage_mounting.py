@@ -22,6 +22,8 @@ from tests.campaigns import InlinePool
 from tests.files import SMALL, echoes, image, noise
 from tests.storage.test_storage_sensors import TURNED, of
 
+pytestmark = pytest.mark.usefixtures("sound_unchecked")
+
 PLACES = {"left": ((0.1, 0.3, -0.2), TURNED), "right": ((0.1, -0.3, 0.4), (0.0, 0.0, 0.0, 1.0))}
 
 
