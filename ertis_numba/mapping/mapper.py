@@ -40,15 +40,11 @@ _PLANAR: Final = np.ix_([0, 1, 5], [0, 1, 5])
 class Mapper:
     """Occupancy map that grows with the images of a platform at known poses.
 
-    Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse, or in a
-    map of three dimensions, of its ellipsoid. Pulses from one viewpoint count as one observation, and points that the
-    fusion does not confirm need two, because ghosts repeat while the platform stands still. Occupied cells lose
-    evidence in pulses that do not return their echo. Cells in front of the first clear echo of a direction become free,
-    but less so at larger distances. A smooth wall that the sound meets obliquely returns no echo, so silence alone
-    shows free space near the platform only, and only as far as a clear echo would exceed the noise. Noise is no echo:
-    without any echo so far, only the place of the platform is free. If no echo proves that a sensor emits
-    (`Fused.without_own_echo`), its silence shows no free space either, because its emitter may be broken; sensors in
-    `Fused.undecided` count as working. Uncertain poses spread the evidence of echoes, and shorten free space.
+    Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse or
+    ellipsoid, and points that the fusion does not confirm must repeat. Cells in front of the first clear echo of a
+    direction become free. Silence alone shows free space near the platform only, and none if no echo proves that a
+    sensor emits (`Fused.without_own_echo`). Uncertain poses spread the evidence of echoes, and shorten free space.
+    docs/how-to/mapping.md has the rules.
 
     Parameters
     ----------

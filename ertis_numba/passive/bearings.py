@@ -33,14 +33,12 @@ _DEAD: Final = 1e-4  # Power relative to the median of the channels, below which
 class BearingFinder:
     """Finder of the bearings of sources in the sound that an acoustic camera has heard.
 
-    In each band, the loudest direction relative to the noise is refined by maximum likelihood over continuous
-    directions. Its wave is then projected out, and the next direction is searched in the rest, until noise alone
-    explains the loudest one: see `exceedance`. Side lobes of a source therefore yield no bearings. After each new
-    source, the directions of all sources of its band are corrected. The noise is a mixture of white noise of the
-    microphones and of diffuse sound, whose shares are estimated in each band. Electrical crosstalk that is equal in all
-    channels looks like sound straight ahead of a flat array: see `Bearing.may_be_crosstalk`. Without passive.focus_m,
-    waves are plane, and the uncertainty contains the error of this for sources from 1 m on; nearer ones need it. If a
-    channel hears nothing, 40 dB below the median of all, uncertainties are infinite: put it in array.disabled.
+    In each band, directions of the largest likelihood are found one by one, until noise alone explains the loudest one:
+    see `exceedance`. Side lobes of a source therefore yield no bearings. docs/explanation/acoustic-maps.md has the
+    steps. Electrical crosstalk that is equal in all channels looks like sound straight ahead of a flat array: see
+    `Bearing.may_be_crosstalk`. Without passive.focus_m, waves are plane, and the uncertainty contains the error of this
+    for sources from 1 m on; nearer ones need it. If a channel hears nothing, 40 dB below the median of all,
+    uncertainties are infinite: put it in array.disabled.
 
     Parameters
     ----------

@@ -69,24 +69,17 @@ def find_sound_sources(
 ) -> list[SoundDirection]:
     """Return the sources of sound in an acoustic map, band by band, strongest first.
 
-    A map shows no uncertainty, so that its sources may be noise, or side lobes where arrays are sparse. If the
-    camera searched for bearings, ``AcousticMap.bearings`` has the sources that are neither, with standard deviations;
-    `ertis peaks` lists these.
+    A map shows no uncertainty, so that its sources may be noise, or side lobes where arrays are sparse. If the camera
+    searched for bearings, ``AcousticMap.bearings`` has the sources that are neither, with standard deviations; `ertis
+    peaks` lists these.
 
-    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources, each at a direction of the grid. Direction and level
-    are those of the map: the level is the sum of the components of all bins in this direction and its neighbours.
+    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources, whose direction and level are those of the map. In
+    other maps, a source is a local maximum, which a quadric through the neighbouring directions interpolates. Maxima
+    below twice the median over all directions are left out, and with delay-and-sum, those below twice the side lobes of
+    stronger sources. The strongest direction of each band is always returned, except in silence.
 
-    In other maps, a source is a local maximum. A quadric through the neighbouring directions interpolates its direction
-    and its level. It fits the logarithm of the power, or for Capon and MUSIC its inverse. Maxima below twice the median
-    over all directions belong to the floor of the map, and are left out. With delay-and-sum, so are maxima below twice
-    the side lobes of stronger sources. The strongest direction of each band is always returned, except in silence.
-
-    An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
-    direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
-    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error. It is infinite if the
-    source may lie beyond the grid: at its edge, or if a source outside fits the map clearly better than any inside.
-    Angles that the array cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
-
+    `SoundDirection.grid_error_rad` states the error of directions at the edge of a grid. It is infinite if the source
+    may lie beyond the grid. Angles that the array cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
     their levels are then too low.
 

@@ -75,23 +75,18 @@ def time_differences(
     The cross-spectrum G of two signals is averaged over blocks under Hann windows that overlap by half. It yields the
     weights of frequencies: ``1 / |G|`` (``phat``), ``1 / √(G₁₁ G₂₂)`` (``scot``) or 1 (``none``). The correlation of
     the whole signals under these weights has its largest maximum at the delay (C. Knapp and G. Carter, The generalized
-    correlation method for estimation of time delay, 1976). Frequencies without coherence, and those whose sound may be
-    that of neighbours under the window, are left out. The later signal is taken later by the delay in whole samples.
+    correlation method for estimation of time delay, 1976). Frequencies without coherence are left out.
 
-    The uncertainty is that of the same work for the weighting W: ``∫ W² ω² G₁₁ G₂₂ (1 − γ²) df / 2 T (∫ W ω² |G| df)²``
-    is the variance for the time T and the coherence γ² as measured in blocks, corrected for its bias. Each further
-    maximum at a delay Δ from the first one adds ``p Δ²`` for its probability p to be the right one. Four uncertainties
-    reach all maxima but those whose probability sums up to 0.4 %. In weak or narrow-band sound, the uncertainty is
-    therefore about that of whole periods.
+    The uncertainty has the variance ``∫ W² ω² G₁₁ G₂₂ (1 − γ²) df / 2 T (∫ W ω² |G| df)²`` for the weighting W, the
+    time T and the coherence γ². Each further maximum at a delay Δ from the first one adds ``p Δ²`` for its probability
+    p to be the right one. In weak or narrow-band sound, the uncertainty is therefore about that of whole periods.
 
     One source without echoes is assumed. If its delay fits the phases of the band significantly worse than the noise
-    allows, there are others: the misfit widens the uncertainty, and so does each maximum above 0.7 times the largest
-    one. Sources or echoes may fit as one where the band does not resolve them (less than about 0.2 divided by its width
-    apart), or where it is narrower than a tenth of its frequencies. The error of their common delay may then exceed the
-    uncertainty. Sound of a steep spectrum, such as 1/f² at 40 dB above the noise, needs ``phat`` or ``scot``:
-    unweighted, its errors may exceed the uncertainty. Signals of steps above a sixth of their standard deviation, and
-    limited ones, have harmonics that shift the delay; the uncertainty contains up to 0.3 samples for them. Sound that
-    both channels pick up electrically, such as hum or several clicks, looks like a source at delay 0.
+    allows, the misfit widens the uncertainty. Sources or echoes may fit as one where the band does not resolve them
+    (less than about 0.2 divided by its width apart), or where it is narrower than a tenth of its frequencies. The error
+    of their common delay may then exceed the uncertainty, and so may that of sound of a steep spectrum, such as 1/f² at
+    40 dB above the noise, without weighting. For coarse or limited signals, the uncertainty contains up to 0.3 samples.
+    Sound that both channels pick up electrically, such as hum or several clicks, looks like a source at delay 0.
 
     Parameters
     ----------

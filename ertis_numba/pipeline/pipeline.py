@@ -361,7 +361,7 @@ class Pipeline:
         Raises
         ------
         DataError
-            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
+            As for `process`.
 
         Examples
         --------
@@ -402,7 +402,7 @@ class Pipeline:
         Raises
         ------
         DataError
-            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
+            As for `process`.
         ArgumentError
             The method is ``paper``, or the beamformer is not ``delay_and_sum``.
 
@@ -449,7 +449,7 @@ class Pipeline:
         Raises
         ------
         DataError
-            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
+            As for `process`.
 
         Examples
         --------
