@@ -9,6 +9,7 @@ import click
 
 from ertis_cli import options
 from ertis_cli._naming import with_options
+from ertis_numba.base.units import runs
 
 if TYPE_CHECKING:
     from ertis_numba.storage.verify import SensorReport
@@ -80,13 +81,7 @@ def _line(report: "SensorReport") -> str:
 
 def _places(places: Iterable[int]) -> str:
     """Return indices as text, with runs of neighbours as ranges."""
-    runs: list[list[int]] = []
-    for place in places:
-        if runs and place == runs[-1][1] + 1:
-            runs[-1][1] = place
-        else:
-            runs.append([place, place])
-    return ", ".join(_span(first, last) for first, last in runs)
+    return ", ".join(_span(first, last) for first, last in runs(places))
 
 
 def _span(first: int, last: int) -> str:

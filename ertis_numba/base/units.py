@@ -1,9 +1,10 @@
 """Units of quantities, derived from the suffixes of their names, counts, and conversion of levels to pressures."""
 
 import math
+from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["counted", "sound_pressure_level_db", "unit_of"]
+__all__ = ["counted", "runs", "sound_pressure_level_db", "unit_of"]
 
 _REFERENCE_PA: Final = 20e-6
 _FULL_SCALE_SINE_DBFS: Final = 20 * math.log10(math.sqrt(0.5))
@@ -31,6 +32,17 @@ _UNITS: Final = {
 def unit_of(name: str) -> tuple[str, str]:
     """Return the suffix of a name and its unit; empty texts if the name has no unit."""
     return next(((suffix, unit) for suffix, unit in _UNITS.items() if name.endswith(suffix)), ("", ""))
+
+
+def runs(numbers: Iterable[int]) -> list[list[int]]:
+    """Return the first and the last of each run of successive numbers, for texts."""
+    found: list[list[int]] = []
+    for number in numbers:
+        if found and number == found[-1][1] + 1:
+            found[-1][1] = number
+        else:
+            found.append([number, number])
+    return found
 
 
 def sound_pressure_level_db(dbfs: float, sensitivity_dbfs: float) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from ertis_numba.analysis.health.kinds import kind_of
 from ertis_numba.analysis.health.not_observable import NotObservable, in_all, not_observable_text
 from ertis_numba.base.errors import ArgumentError
+from ertis_numba.base.units import runs
 
 __all__ = ["ChannelHealth", "Finding", "Health", "merge"]
 
@@ -197,11 +198,5 @@ def _named(channels: Sequence[int], total: int) -> str:
     """Return a text with the channels, in which consecutive channels form ranges."""
     if len(channels) == total:
         return "every channel" if total > 1 else f"channel {channels[0]}"
-    ends: list[list[int]] = []
-    for channel in channels:
-        if ends and channel == ends[-1][1] + 1:
-            ends[-1][1] = channel
-        else:
-            ends.append([channel, channel])
-    parts = [str(a) if a == b else f"{a}-{b}" if b > a + 1 else f"{a}, {b}" for a, b in ends]
+    parts = [str(a) if a == b else f"{a}-{b}" if b > a + 1 else f"{a}, {b}" for a, b in runs(channels)]
     return f"channel{'s' * (len(channels) > 1)} {', '.join(parts)}"

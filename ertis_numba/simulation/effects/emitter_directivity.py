@@ -1,11 +1,9 @@
 """Directivity of the emitter as a circular piston."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._piston import piston
+from ertis_numba.simulation.effects._piston import in_baffle
 from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths
@@ -23,9 +21,7 @@ def gain(
         return 1.0
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
     cos = np.einsum("pmx,px->pm", leaving, paths.transmitter.facing)
-    sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
-    pattern = piston(math.pi * emitter.diameter_m / shot.speed_m_s * sin[..., None] * frequency_hz)
-    return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))
+    return in_baffle(cos, emitter.diameter_m, shot.speed_m_s, frequency_hz)
 
 
 def estimate(sight: Sight) -> Estimate | None:

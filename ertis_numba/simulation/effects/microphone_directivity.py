@@ -1,11 +1,9 @@
 """Directivity of the microphone ports."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._piston import piston
+from ertis_numba.simulation.effects._piston import in_baffle
 from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths
@@ -23,9 +21,7 @@ def gain(
     if not diameter_m:
         return 1.0
     cos = -np.einsum("pmx,px->pm", paths.arriving, paths.receiver.axes[:, 0])
-    sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
-    pattern = piston(math.pi * diameter_m / shot.speed_m_s * sin[..., None] * frequency_hz)
-    return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))
+    return in_baffle(cos, diameter_m, shot.speed_m_s, frequency_hz)
 
 
 def estimate(sight: Sight) -> Estimate | None:
