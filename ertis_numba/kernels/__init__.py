@@ -5,17 +5,7 @@
 """
 
 from ertis_numba.kernels._compile_notice import on_compiling
-from ertis_numba.kernels._contract.fusion import (
-    AUDIBLE,
-    DISTURBING,
-    LAST_PATH_M,
-    NEAREST_M,
-    SPREADING_M,
-    FusionKernels,
-    HeardEchoes,
-    SeenPlaces,
-    ViewingSensors,
-)
+from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._contract.points import (
     ABSENT,
@@ -25,6 +15,16 @@ from ertis_numba.kernels._contract.points import (
     PointKernels,
     Pulse,
     Quadrics,
+)
+from ertis_numba.kernels._contract.reflectors import (
+    AUDIBLE,
+    DISTURBING,
+    LAST_PATH_M,
+    NEAREST_M,
+    SPREADING_M,
+    HeardEchoes,
+    SeenPlaces,
+    ViewingSensors,
 )
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
