@@ -8,7 +8,7 @@ import numpy as np
 
 from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.fuser import Fused, Fuser
+from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
 
