@@ -58,8 +58,8 @@ class PulseReceiver:
     """Receiver that groups the images of a central node by SYNC pulse, in a thread.
 
     A pulse is complete with all sensors of the two pulses before, after three later pulses, or after 0.25 s without an
-    image. Sensors without a mounting, and those that send NaN, are left out with a note. As many threads as there are
-    cores call ``on_image``, unless a pulse waits for `receive`.
+    image. Sensors without a mounting, and those that send NaN, are left out with a note. Threads on all cores except
+    one call ``on_image``, unless a pulse waits for `receive`.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class PulseReceiver:
         self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
         self._mountings: dict[str, _Place] = dict(self._given)
         self._left_out: set[str] = set()  # Sensors without a mounting, or with numbers that are not finite.
-        self._n_threads = usable_cores()
+        self._n_cores = usable_cores()
         self._owner = Owner("receiver")
         self._thread = threading.Thread(target=self._run, name="ertis-pulse-receiver", daemon=True)
         self._thread.start()
@@ -125,7 +125,9 @@ class PulseReceiver:
     def _run(self) -> None:
         """Form groups until `close`."""
         latest_s = time.monotonic()
-        pool = ThreadPoolExecutor(self._n_threads, thread_name_prefix="ertis-images")
+        # The application fuses meanwhile, and finds what no thread has begun to find. With a thread for each core, they
+        # would wait for each other.
+        pool = ThreadPoolExecutor(max(1, self._n_cores - 1), thread_name_prefix="ertis-images")
         try:
             while not self._subscriber.closed:
                 image = self._subscriber.receive(_POLL_S)
@@ -144,7 +146,7 @@ class PulseReceiver:
     def _add(self, received: _Received, pool: ThreadPoolExecutor) -> None:
         """Add an image to its group."""
         if self._on_image is not None and self.queue.is_empty:
-            if self._n_threads == 1:  # Others would only compete with this one.
+            if self._n_cores == 1:  # Others would only compete with this one.
                 self._on_image(received.image)
             else:
                 with suppress(RuntimeError):  # No thread can start, or the main thread has ended.
