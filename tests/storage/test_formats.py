@@ -13,6 +13,7 @@ from ertis_numba.storage.schema import (
     ENERGYSCAPE,
     FORMAT_VERSION,
     OCCUPANCY_MAP,
+    OLDEST_VERSION,
     POINTS,
     POSES,
     RECORDING,
@@ -64,7 +65,7 @@ def test_format_tables_match_the_code(first, table):
 def test_format_names_and_versions_match_the_code():
     assert f"`{CONVENTIONS}`" in PAGE
     versions = f"{VERSION_WITHOUT_POSES}; {FORMAT_VERSION} with poses, and for fused files with points"
-    assert f"| {versions} | 1 to {FORMAT_VERSION} |" in PAGE
+    assert f"| {versions} | {OLDEST_VERSION} to {FORMAT_VERSION} |" in PAGE
 
 
 def test_format_presets_match_the_code():
