@@ -25,6 +25,7 @@ __all__ = [
     "is_better",
     "is_heard",
     "is_much_better",
+    "is_proven",
     "silence_ratios",
     "silent_one",
     "suspect",
@@ -44,6 +45,8 @@ _ALIKE: Final = 3  # Difference of unexplained and missed echoes within which ex
 _TIMES: Final = 1.25  # Ratio of the lengths of two descriptions, of which the longer one is wrong, …
 _MORE: Final = 9  # … and their difference.
 _CHEAP: Final = 0.9  # Ratio of costs below which the silence of an emitter explains echoes clearly better.
+_N_UNEXPLAINED: Final = 1  # Echoes up to which no sound over several surfaces is present, …
+_N_MISSING: Final = 2  # … and otherwise confirmed reflectors that must miss a call.
 _N_SENSORS: Final = 3  # Emitters of which one can be told from the others.
 _N_OTHERS: Final = 2  # Echoes of other calls that locate a reflector.
 _RADIATED: Final = 10 ** (-16.5 / 10)  # Power to the side, below which models of emitters are uncertain.
@@ -134,6 +137,16 @@ def cheapest(joint: int, costs: Mapping[int, int]) -> int | None:
         return None
     least, others = costs[ascending[0]], [joint, *(costs[each] for each in ascending[1:])]
     return ascending[0] if all(is_better(least, each) and least < _CHEAP * each for each in others) else None
+
+
+def is_proven(number: int, expected: ExpectedEchoes, reflectors: Reflectors) -> bool:
+    """Return True if echoes show that a piston is silent; ``reflectors`` explain them without it.
+
+    Sound over several surfaces seems to come from reflectors that do not exist, and miss the calls of working emitters.
+    """
+    misses = expected.is_missed[:, :, number].any(axis=1) & ~expected.is_heard[:, :, number].any(axis=1)
+    misses &= reflectors.confirmed & (reflectors.radiated[:, number] > _RADIATED)
+    return reflectors.n_unexplained <= _N_UNEXPLAINED or int(misses.sum()) >= _N_MISSING
 
 
 def is_heard(counts: EmissionCounts, number: int) -> bool:

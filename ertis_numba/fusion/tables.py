@@ -15,12 +15,14 @@ from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
 from ertis_numba.fusion.emissions import (
     EmissionCounts,
+    ExpectedEchoes,
     PulseEvidence,
     cheapest,
     doubted,
     expected_echoes,
     is_better,
     is_heard,
+    is_proven,
     silence_ratios,
     silent_one,
     suspect,
@@ -74,6 +76,7 @@ class _Explained(NamedTuple):
     counts: EmissionCounts
     without_echo: list[int]
     cost: int
+    expected: ExpectedEchoes
 
 
 class FusionTables:
@@ -240,6 +243,9 @@ class FusionTables:
                 costs = {number: each.cost for number, each in likely.items()}
                 counts = {number: each.counts for number, each in likely.items()}
                 found = silent_one(suspected, explained.counts, costs, counts)
+        if found is not None and not self._is_omnidirectional:
+            each = rivals[found][1]
+            found = found if is_proven(found, each.expected, each.reflectors) else None
         return None if found is None else (found, *rivals[found])
 
     def emitters(self, group: Mapping[int, Energyscape]) -> frozenset[int]:
@@ -321,7 +327,7 @@ class FusionTables:
         # Dense echoes of reflectors may be unclear, too. Unclear echoes are noise only if no reflector is located.
         is_any = bool(reflectors.located)
         without_echo = [each.receiver for each in echoes if (each.is_faint | ~(each.is_clear | is_any)).all()]
-        return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed)
+        return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed, expected)
 
     def _echoes(self, group: Mapping[int, Energyscape], attributed: Attributed) -> list[SensorEchoes]:
         return [

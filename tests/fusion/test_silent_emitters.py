@@ -13,10 +13,12 @@ import ertis_numba as ertis
 from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.emissions import (
     EmissionCounts,
+    ExpectedEchoes,
     PulseEvidence,
     best_evidence,
     cheapest,
     doubted,
+    is_proven,
     silent_one,
     suspect,
 )
@@ -214,6 +216,24 @@ def test_emitters_that_no_echo_shows_are_doubted(counted, cost, expected):
 )
 def test_silence_must_explain_echoes_clearly_better(joint, costs, expected):
     assert cheapest(joint, costs) == expected
+
+
+@pytest.mark.parametrize(
+    ("n_unexplained", "confirmed", "heard", "expected"),
+    [
+        (1, [False, False], [False, False], True),  # no sound over several surfaces
+        (2, [True, True], [False, False], True),
+        (2, [True, False], [False, False], False),  # The other reflector may not exist, …
+        (2, [True, True], [True, False], False),  # … or this one shows the call.
+    ],
+)
+def test_sound_over_several_surfaces_does_not_prove_that_a_piston_is_silent(n_unexplained, confirmed, heard, expected):
+    """Two reflectors, which miss the call of the second of two emitters at a receiver."""
+    missed, is_heard = np.zeros((2, 2, 2, 2), np.bool_)
+    missed[:, 0, 1], is_heard[:, 1, 1] = True, heard
+    radiated = np.ones((2, 2))
+    reflectors = SimpleNamespace(n_unexplained=n_unexplained, confirmed=np.array(confirmed), radiated=radiated)
+    assert is_proven(1, ExpectedEchoes(is_heard, missed), reflectors) == expected
 
 
 @pytest.mark.parametrize(
