@@ -1,5 +1,7 @@
 """Measurements of the sensors of one platform, grouped by SYNC pulse."""
 
+import math
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -34,6 +36,9 @@ __all__ = [
     "processing",
     "pulse_groups",
 ]
+
+
+_NEAR_EVERY = 8  # Measurements, of which one is searched for echoes from before the first range.
 
 
 def processing(command: "Callable[..., Any]") -> "Callable[..., Any]":
@@ -240,12 +245,15 @@ class PipelinesBySensor:
         *,
         quiet: bool,
         without: "ExcludedChannels | None" = None,
+        mountings: "Mapping[str, Mounting] | None" = None,
         **device: Any,
     ) -> None:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._without = without
+        self._near = _NearEchoes({} if mountings is None else mountings)
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
         self._checked: set[str] = set()
+        self._is_coarse = False
         self.warnings: list[str] = []
 
     def settings(self, reader: "RecordingReader") -> "Settings":
@@ -261,11 +269,17 @@ class PipelinesBySensor:
             self._checked.add(image.stamp.sensor)
             options.note_unknown_places(image.stamp.sensor, image.settings, quiet=self._quiet)
             options.note_height(image.settings, image, quiet=self._quiet)
-            text = None if self.warnings else spacing_warning(image.settings, image)
+            text = None if self._is_coarse else spacing_warning(image.settings, image)
             if text is not None:
-                self.warnings.append(text)
-                options.warn(text)
+                self._is_coarse = True
+                self._warn(text)
+        if (text := self._near.warning(measurement, image.settings)) is not None:
+            self._warn(text)
         return image
+
+    def _warn(self, text: str) -> None:
+        self.warnings.append(text)
+        options.warn(text)
 
     def _image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
         from ertis_numba.frames import Energyscape
@@ -288,3 +302,31 @@ class PipelinesBySensor:
             self._made[sensor] = settings, self._stack.enter_context(pipeline)
         pipeline = self._made[sensor][1]
         return pipeline.process(replace(measurement, settings=pipeline.settings))
+
+
+class _NearEchoes:
+    """Check for obstacles before the first range, in one of eight measurements of each sensor until it finds one."""
+
+    def __init__(self, mountings: "Mapping[str, Mounting]") -> None:
+        self._mountings = mountings
+        self._counts: Counter[str] = Counter()
+        self._found: set[str] = set()
+
+    def warning(self, measurement: "Measurement | Energyscape", settings: "Settings") -> str | None:
+        """Return a warning of an obstacle in front of a mounted sensor, or None."""
+        from ertis_numba.analysis.near_echo import near_echo_m, near_warning
+        from ertis_numba.frames import Measurement
+
+        sensor = measurement.stamp.sensor
+        if not isinstance(measurement, Measurement) or sensor not in self._mountings or sensor in self._found:
+            return None
+        self._counts[sensor] += 1
+        if self._counts[sensor] % _NEAR_EVERY != 1:
+            return None
+        place_m = self._mountings[sensor][0]
+        others_m = [math.dist(place_m, other_m) for name, (other_m, _) in self._mountings.items() if name != sensor]
+        found_m = near_echo_m(replace(measurement, settings=settings), others_m)
+        if found_m is None:
+            return None
+        self._found.add(sensor)
+        return near_warning(sensor, found_m, settings.processing.range_m[0], is_alone=not others_m)

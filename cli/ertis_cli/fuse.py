@@ -113,7 +113,9 @@ def _write_fused(
         mountings = _pulses.platform_mountings(readers, mounting, quiet=quiet)
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
         without.require_known([reader.sensor for reader in readers])
-        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, without=without, **device)
+        pipelines = _pulses.PipelinesBySensor(
+            changed, stack, quiet=quiet, without=without, mountings=mountings, **device
+        )
         active = _pulses.active_groups(readers, changed, quiet=quiet)
         groups = active.groups
         by_name = {reader.sensor: reader for reader in readers}

@@ -108,13 +108,14 @@ def mapping(
     target = target or paths[0].with_suffix(".map.h5")
     for each in map_files(target, n_dimensions=dimensions, probabilities=probabilities):
         check_target(each, overwrite=force, sources=paths)
-
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack, images=True)
         trajectory = _trajectory(poses_file, paths, quiet=quiet, **reading)
         changed = _pulses.image_settings(settings_file, preset)
-        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
         mountings = _pulses.platform_mountings(readers, mounting, quiet=quiet)
+        pipelines = _pulses.PipelinesBySensor(
+            changed, stack, quiet=quiet, mountings=mountings, device=device, threads=threads, plan=plan
+        )
         truth = PlacedTruth(readers, mountings, trajectory)
         mapper = Mapper(
             mountings,
@@ -125,8 +126,7 @@ def mapping(
             emitter_diameter_m=emitter_diameter_m,
         )
         active = _pulses.active_groups(readers, changed, quiet=quiet)
-        groups = active.groups
-        located = _located(groups, trajectory)
+        located = _located(active.groups, trajectory)
         _note_gaps(located, trajectory, quiet=quiet)
         by_name = {reader.sensor: reader for reader in readers}
         _pulses.note_missing(located, [*by_name], quiet=quiet)
@@ -145,16 +145,16 @@ def mapping(
     _pulses.note_truth(truth, quiet=quiet)
     placed = truth.truth(height_m)
     written = write_map(target, occupancy, overwrite=force, probabilities=probabilities, truth=placed)
-    if len(located) < len(groups):
-        left_out = options.counted(len(groups) - len(located), "pulse")
-        options.note(f"{left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
+    if len(located) < len(active.groups):
+        left_out = options.counted(len(active.groups) - len(located), "pulse")
+        options.note(f"{left_out} of {len(active.groups)} outside of the time of the poses left out", quiet=quiet)
     report = _report(written, readers, occupancy) | {
-        "left_out": active.n_passive + len(groups) - len(located),
+        "left_out": active.n_passive + len(active.groups) - len(located),
         "empty": mapper.n_empty,
         "without_own_echo": mapper.without_own_echo,
         "simulated": placed is not None and target.suffix.lower() == ".h5",
         "notes": list(trajectory.notes),
-        "warnings": warned,
+        "warnings": [*pipelines.warnings, *warned],
     }
     options.say(_summary(target, len(located), report), quiet=quiet)
     if as_json:

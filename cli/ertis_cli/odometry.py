@@ -87,7 +87,9 @@ def odometry(
         readers = _pulses.open_sensors(paths, stack)
         mountings = _pulses.mountings_of(readers, mounting)
         changed = _pulses.image_settings(settings_file, preset)
-        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        pipelines = _pulses.PipelinesBySensor(
+            changed, stack, quiet=quiet, mountings=mountings, device=device, threads=threads, plan=plan
+        )
         active = _pulses.active_groups(readers, changed, quiet=quiet)
         found = odometry_of(readers, active.groups, pipelines, mountings, alone=alone or None, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)

@@ -44,6 +44,7 @@ class Mapper:
     ellipsoid, and points that the fusion does not confirm must repeat. Cells in front of the first clear echo of a
     direction become free. Silence alone shows free space near the platform only, and none if no echo proves that a
     sensor emits (`Fused.without_own_echo`). Uncertain poses spread the evidence of echoes, and shorten free space.
+    An obstacle nearer than the first range of the images may hide others, so that space behind it becomes free.
     docs/how-to/mapping.md has the rules.
 
     Parameters
