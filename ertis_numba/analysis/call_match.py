@@ -129,7 +129,9 @@ def _match(sound: SoundSpectra, call: Call) -> CallMatch:
     """Return the match of a call with a sound, without the time of the direct sound."""
     is_heard, curve = _is_heard(sound, call), curve_of(call)
     if is_heard and curve is None:
-        return CallMatch("matches")
+        found = find_sweep(sound)  # A waveform that was read with another sample rate is a longer or shorter call.
+        other = SILENT if found is None or found.sweep.high_hz > _MAX_SWEEP_HZ else _compared(sound, found, call)
+        return CallMatch("matches") if other is SILENT else other
     judged = SILENT
     if is_heard and curve is not None:
         arrival = arrival_of(sound, curve, call.low_frequency_hz, call.high_frequency_hz)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 
-__all__ = ["FILTERS", "MAX_FILTER_TAPS", "FirFilters", "check_taps"]
+__all__ = ["FILTERS", "MAX_FILTER_TAPS", "FirFilters", "check_taps", "delay_of"]
 
 FILTERS: Final = ("pre_filter", "post_filter")
 """Keys of own filters in the order in which they apply."""
@@ -18,10 +18,11 @@ FILTERS: Final = ("pre_filter", "post_filter")
 MAX_FILTER_TAPS = 1024
 """Limit on the taps of a filter."""
 _LARGEST_TAP = 1e6
+_ROUNDING = 1e-9  # Largest difference of equal taps, relative to the largest tap.
 
 
 class FirFilters(NamedTuple):
-    """FIR filters that follow one another, without the delay of half of their length."""
+    """FIR filters that follow one another, without their delay, which is half of their length for symmetric taps."""
 
     rate_hz: float
     taps: tuple[tuple[float, ...], ...]
@@ -41,19 +42,28 @@ class FirFilters(NamedTuple):
 
     @property
     def half_length_s(self) -> float:
-        """Half of the duration of the combined filter in seconds, by which it extends signals on either side."""
-        return sum(len(each) - 1 for each in self.taps) / (2 * self.rate_hz)
+        """Longest time by which the combined filter extends signals on either side, in seconds."""
+        return sum(max(delay_of(each), len(each) - 1 - delay_of(each)) for each in self.taps) / self.rate_hz
 
     def response(self, frequency_hz: NDArray[np.floating]) -> NDArray[np.complex128]:
         """Return the combined gain: (frequency,).
 
-        ``F(f) = Π Σ_k h_k exp(-2πi f (k − (n − 1) / 2) / rate)`` over the filters of n taps h.
+        ``F(f) = Π Σ_k h_k exp(-2πi f (k − d) / rate)`` over the filters of taps h with the delay d of `delay_of`.
         """
         turn = np.exp(-2j * math.pi * frequency_hz / self.rate_hz)
         gain: NDArray[np.complex128] = np.ones(len(frequency_hz), dtype=np.complex128)
         for taps in self.taps:
-            gain *= np.polynomial.polynomial.polyval(turn, np.array(taps)) * turn ** (-(len(taps) - 1) / 2)
+            gain *= np.polynomial.polynomial.polyval(turn, np.array(taps)) * turn ** -delay_of(taps)
         return gain
+
+
+def delay_of(taps: tuple[float, ...]) -> float:
+    """Return the delay of a filter in samples: the mean of its group delay, weighted by the power that it passes."""
+    given, rounding = np.array(taps), _ROUNDING * np.max(np.abs(taps))
+    if min(np.abs(given - given[::-1]).max(), np.abs(given + given[::-1]).max()) <= rounding:
+        return (len(taps) - 1) / 2
+    power = given**2  # By Parseval's theorem, the mean of the group delay is the centre of these powers.
+    return float(np.arange(len(taps)) @ power / power.sum())
 
 
 def check_taps(name: str, taps: tuple[float, ...]) -> None:

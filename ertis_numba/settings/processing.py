@@ -91,8 +91,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     pre_filter, post_filter : str or list of float, default []
         Taps of own FIR filters, 1 to 1024, or the name of a CSV or NPY file with them. ``pre_filter`` filters the
         signals of the microphones, ``post_filter`` the beams, which only delay_and_sum has. Both are combined with the
-        matched filter and cost no time. Their delay of half of their length and their gain are compensated: the
-        amplitude of an echo stays the same unless they distort phases. They need the fast method.
+        matched filter and cost no time. Their mean group delay (half of their length, if the taps are symmetric) and
+        their gain are compensated: the amplitude of an echo stays the same unless they distort phases. They need the
+        fast method.
     filter_rate_hz : float, optional, default None
         Sample rate for which the taps of both filters are designed, more than twice the call's highest frequency; by
         default that of the signals, `Settings.signal_rate_hz`.

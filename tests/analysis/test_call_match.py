@@ -61,6 +61,19 @@ def test_call_match_finds_other_presets(emitted):
     assert "opposite" not in found.warning
 
 
+def sampled(rate_hz):
+    """The call as a waveform at a sample rate that the settings state as 450 kHz."""
+    time_s = np.arange(round(CALL.duration_s * rate_hz)) / rate_hz
+    return CALL.replace(waveform=tuple(call_at(CALL, time_s).tolist()), sample_rate_hz=450e3)
+
+
+@pytest.mark.parametrize(("rate_hz", "is_right"), [(450e3, True), (500e3, False), (400e3, False), (300e3, False)])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_waveforms_of_another_sample_rate_are_reported(rate_hz, is_right, noise):
+    found = call_match(heard(CALL, noise=noise, settings=SETTINGS.replace(call=sampled(rate_hz))))
+    assert (found.verdict == "matches", not found.warning) == (is_right, is_right)
+
+
 def chirps(start_khz, stop_khz, duration_ms, method, *, echoes=((8e-3, 1.0),), noise=0.01, rate_hz=450e3):
     """Echoes of a chirp of SciPy at 6 microphones of an array, as 32-bit floats."""
     time_s = np.arange(round(0.025 * rate_hz)) / rate_hz

@@ -131,6 +131,59 @@ def test_arrays_of_few_inexact_microphones_are_not_accused(count, seed):
     assert not layout_match(read_as(both, delay_s=rng.normal(0, 3e-6, count))).warning
 
 
+def grid(count=4, pitch_m=0.006):
+    across_m = (np.arange(count) - (count - 1) / 2) * pitch_m
+    y_m, z_m = np.meshgrid(across_m, across_m[::-1])
+    return np.stack([0 * y_m.ravel(), y_m.ravel(), z_m.ravel()], axis=1)
+
+
+def snake(count=4):
+    order = np.arange(count**2).reshape(count, count)
+    order[1::2] = order[1::2, ::-1]
+    return order.ravel()
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("count", [12, 16, 32])
+def test_any_wrong_order_of_channels_is_named(count, seed):
+    order = np.random.default_rng([count, seed]).permutation(count)
+    found = layout_match(read_as(heard(disc(0.08, count)), positions_m=disc(0.08, count)[order])).finding
+    assert (found.fault, len(found.channels)) == ("order of channels", count)
+
+
+def test_order_that_only_echoes_show_is_named():
+    """The direct sound of an emitter in the middle arrives at both ends of a row of microphones at once."""
+    echo, call = heard(grid()), SETTINGS.call
+    time_s = np.arange(SETTINGS.recording.n_samples)[:, None] / SETTINGS.recording.sample_rate_hz
+    direct = 15000 * call_at(call, time_s - np.linalg.norm(grid(), axis=1) / SPEED_M_S)
+    both = dataclasses.replace(echo, data=(echo.data + direct).astype(np.int16))
+    assert not layout_match(both).warning
+    assert layout_match(read_as(both, positions_m=grid()[snake()])).finding.fault == "order of channels"
+
+
+@pytest.mark.parametrize("inverted", [range(8, 16), range(1, 16, 2), range(5), range(10)])
+def test_opposite_signs_of_many_channels_are_named(inverted):
+    echo = heard(disc(0.08))
+    words = echo.data.copy()
+    words[:, list(inverted)] *= -1
+    found = layout_match(dataclasses.replace(echo, data=words)).finding
+    few = set(inverted) if len(inverted) <= 8 else set(range(16)) - set(inverted)
+    assert (found.fault, set(found.channels) in (few, set(range(16)) - few)) == ("polarity of channels", True)
+
+
+@pytest.mark.parametrize("n_echoes", [1, 2, 4])
+def test_right_arrays_are_not_accused_by_close_echoes(n_echoes):
+    rng = np.random.default_rng(n_echoes)
+    for seed in range(25):
+        places_m = (disc(rng.uniform(0.02, 0.1), int(rng.choice([8, 16, 32]))), grid())[seed % 2]
+        echoes = [
+            heard(places_m, source_m=rng.uniform([0.6, -0.6, -0.4], [1.3, 0.6, 0.4]), level=rng.uniform(800, 3000))
+            for _ in range(n_echoes)
+        ]
+        words = sum(each.data for each in echoes).astype(np.int16)
+        assert not layout_match(dataclasses.replace(echoes[0], data=words)).warning, seed
+
+
 @pytest.mark.parametrize("factor", [10, 0.1, 1 / 2.54])
 def test_scaled_layouts_are_named_by_their_unit(factor):
     array = load_layout("eRTIS_v3D1")

@@ -41,6 +41,15 @@ def decibels(difference, wanted):
     return 20 * np.log10(np.linalg.norm(difference) / np.linalg.norm(wanted))
 
 
+def mean_delay(taps):
+    """Group delay by SciPy in samples, weighted by the power that the filter passes: half of symmetric lengths."""
+    frequency, delay = scipy.signal.group_delay(
+        (taps, 1), 4095, whole=True
+    )  # without half of the sample rate, where it may be 0
+    power = np.abs(scipy.signal.freqz(taps, worN=frequency)[1]) ** 2
+    return np.sum(power * delay) / np.sum(power)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("device", ["cpu", "numpy"])
 def test_image_equals_the_exact_one(kind, device):
@@ -55,7 +64,7 @@ def test_image_equals_the_exact_one(kind, device):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_matched_signals_equal_those_of_a_convolution(kind):
-    """Filter in the time domain in float64, advance by half of the length, and compensate the gain."""
+    """Filter in the time domain in float64, advance by the mean group delay, and compensate the gain."""
     settings = filtered(kind).replace(**{"processing.decimation": 10, "processing.range_decimation": 100})
     with Pipeline(settings, "numpy", predict=False) as pipeline:
         signals = pipeline.signals(noise(settings))
@@ -74,7 +83,7 @@ def test_matched_signals_equal_those_of_a_convolution(kind):
     gain = power.sum() / np.sum(power * np.abs(scipy.signal.freqz(taps, worN=frequency_hz, fs=RATE_HZ)[1]))
     spectra = scipy.fft.fft(convolved, n_fft, axis=1)
     out = np.zeros_like(spectra)
-    advance = np.exp(2j * np.pi * frequency_hz * (2000 + (len(taps) - 1) / 2) / RATE_HZ)
+    advance = np.exp(2j * np.pi * frequency_hz * (2000 + mean_delay(taps)) / RATE_HZ)
     out[:, inside] = spectra[:, inside] * spectrum.values * advance * gain
     wanted = scipy.fft.ifft(out, axis=1)[:, : signals.matched.shape[1]]
     assert decibels(signals.matched - wanted, wanted) < -100
@@ -93,6 +102,25 @@ def test_symmetric_filters_move_no_echo_and_keep_its_amplitude():
     for time_s, peak in found[1:]:
         assert time_s == pytest.approx(found[0][0], abs=2 / ECHO_SETTINGS.signal_rate_hz)
         assert peak == pytest.approx(found[0][1], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "taps",
+    [
+        (*LOWER_HALF, *(0.0,) * 60),
+        (0.0, 0.0, 1.0),
+        tuple(scipy.signal.minimum_phase(scipy.signal.firwin(151, (20e3, 60e3), fs=RATE_HZ, pass_zero=False)).tolist()),
+    ],
+    ids=["zeros behind", "delay only", "minimum phase"],
+)
+def test_filters_that_are_not_symmetric_move_echoes_by_less_than_two_millimetres(taps):
+    processing = ECHO_SETTINGS.processing.replace(pre_filter=taps, filter_rate_hz=RATE_HZ)
+    measurement, found = heard(CALL, echoes=((6e-3, 1.0),)), []
+    for settings in (ECHO_SETTINGS, ECHO_SETTINGS.replace(processing=processing)):
+        with Pipeline(settings, "numpy", predict=False) as pipeline:
+            signals = pipeline.signals(type(measurement)(measurement.data, settings))
+        found.append(signals.time_s[np.abs(signals.matched[3]).argmax()])
+    assert 0.5 * 343.2 * abs(found[1] - found[0]) < 2e-3
 
 
 @pytest.mark.parametrize("weighting", ["none", "coherence_factor"])

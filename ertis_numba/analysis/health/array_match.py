@@ -18,12 +18,13 @@ from ertis_numba.analysis.health.report import Finding
 from ertis_numba.analysis.health.wave_shapes import CURVATURES, curved_m, fit_curved, places_of
 from ertis_numba.geometry import Layout, layout_names, load_layout
 
-__all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array", "unobservable"]
+__all__ = ["ARRAY_FAULTS", "POLARITY", "SIZE", "find_other_array", "is_misfit", "unobservable"]
 
 _HALF: Final = "half late"
+POLARITY: Final = "polarity of channels"
 SIZE: Final = "size of the array"
-ARRAY_FAULTS: Final = frozenset({ORDER, _HALF, SIZE})
-"""Faults that `find_other_array` finds."""
+ARRAY_FAULTS: Final = frozenset({ORDER, POLARITY, _HALF, SIZE})
+"""Faults of the array as a whole."""
 
 _MAX_MICS_OF_ORDERS: Final = 16
 _MIN_SPARE: Final = 2  # Channels beyond the unknowns of a fit.
@@ -41,6 +42,8 @@ _MAX_SLOWNESS: Final = 1.1  # Slowness across the array relative to that of soun
 _MIN_EXCLUDED: Final = 4.0  # Residuals of an order that an arrival excludes, relative to those of the given one.
 _CLEAR: Final = 0.05  # Residuals of a clear arrival relative to its delays across the array.
 _DEVIATIONS: Final = 8.0
+_DELAY_SD_S: Final = 3e-6  # Standard deviation of the delays of microphones.
+_UNLIKELY: Final = 3.7  # Deviation of a normal distribution that one of 10,000 arrays exceeds.
 # Limits of the size relative to the given one; a record that begins before the emission explains a larger one, too.
 _MAX_GROWTH: Final = 2.5
 _MIN_SHRINKAGE: Final = 0.67
@@ -273,6 +276,16 @@ def _best(
     solution, spread_s = _solve(times_s - travel_s, of_emitter)
     matches.append(_Match(spread_s, 0.0, 0.0 if late is None else float(solution[-1]), n_spare + n_axes))
     return min(matches, key=lambda match: match.spread_s)
+
+
+def is_misfit(times_s: NDArray[np.float64], positions_m: NDArray[np.float64], path_m: float, speed_m_s: float) -> bool:
+    """Return True if no wavefront fits times of arrival as well as tolerances of microphones permit."""
+    best = _best(times_s, positions_m, path_m, speed_m_s)
+    if best is None:
+        return False
+    # E. B. Wilson and M. M. Hilferty, The distribution of chi-square, Proc. Natl. Acad. Sci. 17, 1931.
+    share = 2 / (9 * best.n_spare)
+    return best.spread_s > _DELAY_SD_S * (1 - share + _UNLIKELY * math.sqrt(share)) ** 1.5
 
 
 def _kept(n_mics: int, n_unknowns: int) -> int:

@@ -1,25 +1,25 @@
 """Checks on the wavefront of the strongest arrival: polarity, order and delay of channels, and time of the emission."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.health.array_match import SIZE, find_other_array, unobservable
+from ertis_numba.analysis.health.array_match import POLARITY, SIZE, find_other_array, is_misfit, unobservable
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
+from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, half_gate, mean_of
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.analysis.health.levels import gain_findings
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
-from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, OF_ARRIVAL, SINGLE_ECHO, NotObservable
+from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, OF_ARRIVAL, ORDER, SINGLE_ECHO, NotObservable
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
-__all__ = ["Coherence", "aligned", "by_array", "by_wavefront", "correlate", "half_bands", "mean_of"]
+__all__ = ["by_array", "by_wavefront"]
 
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
 _MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.
@@ -39,6 +39,11 @@ _SAME = 0.95  # Minimum coherence of a channel whose delay or level is compared.
 _INVERTED = 0.97
 _OPPOSITE = 1.08  # Minimum ratio of negative to positive correlation; half a period of an octave band has 0.83.
 _MAX_SUSPECTS = 0.25  # Maximum share of microphones; if more disagree, the arrival is the cause.
+_MAX_OTHERS = 0.1  # Share of the channels that may hear another echo beside the strongest.
+_ONE_SOUND = 0.99  # Least similarity of all but a tenth of the channels in a single sound; overlapping ones have less.
+_TWO_SIGNS = 0.5  # Least mean of squared phasors, whose phases differ by half a turn.
+_MISFIT_S = 3.5e-6  # RMS of the smaller three quarters of the residuals; delays with a deviation of 3 µs have 1.7 µs.
+_AFTER_DIRECT_S = 2e-3  # Time after the direct sound at which an echo is examined, too.
 
 
 _INCOHERENT = "the channels contain different sounds at the strongest arrival"
@@ -46,11 +51,6 @@ _OF_CHANNELS = OF_ARRIVAL[:3]
 _SHIFT = NotObservable(
     faults=OF_ARRIVAL[-1:], reason="the strongest arrival is not the direct sound", remedy=KNOWN_PLACE
 )
-
-
-_LAG_STEP_S = 1e-6
-_NEAR_ZERO_S = 10e-6
-_GATE_PERIODS = 2.0  # Length of the gate on either side, in units of 1 / bandwidth.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,11 +79,29 @@ def _arrival(
     signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
 ) -> _StrongestSound | None:
     """Return the strongest arrival, compared with other arrays; None if no arrival exceeds the background."""
+    arrival = _arrival_after(signals, channels, settings, n_samples, -math.inf)
+    if arrival is None or arrival.other is not None or not arrival.is_near:
+        return arrival
+    # An echo is examined, too: the direct sound arrives at opposite microphones of a ring or grid at once.
+    earliest_s = float(arrival.times_s.max()) + _AFTER_DIRECT_S
+    echo = _arrival_after(signals, channels, settings, n_samples, earliest_s)
+    is_wrong = echo is not None and echo.other is not None and echo.other.fault in (ORDER, POLARITY)
+    return replace(arrival, other=echo.other) if is_wrong else arrival
+
+
+def _arrival_after(
+    signals: Callable[[int], NDArray[np.float32]],
+    channels: Sequence[int],
+    settings: Settings,
+    n_samples: int,
+    earliest_s: float,
+) -> _StrongestSound | None:
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     positions_m = layout.positions_m[list(channels)]
     rate_hz = settings.recording.sample_rate_hz
-    first, last = _loudest(signals, channels, settings, n_samples)
+    first, last = _loudest(signals, channels, settings, n_samples, earliest_s)
     found = compress(signals, channels, settings.call, rate_hz=rate_hz, first=first, last=last)
+    found.envelope[:, found.start_s + np.arange(found.envelope.shape[1]) * found.step_s < earliest_s] = 0.0
     width_s = float(2 * np.linalg.norm(positions_m, axis=1).max(initial=0.0)) / speed_m_s
     arrived = strongest(found, width_s)
     is_small = arrived is None  # Positions in a larger unit would spread an arrival over most of the record.
@@ -100,7 +118,72 @@ def _arrival(
         other = None
     if is_small and other is None:
         return None
+    if other is None and not is_small and not is_near:  # The place of the emitter may differ from that of the array.
+        other = _misfit(found, times_s, path_m, list(channels), layout, speed_m_s)
     return _StrongestSound(found, times_s, path_m, is_near, shifts, other)
+
+
+def _misfit(
+    found: Compressed,
+    times_s: NDArray[np.float64],
+    path_m: float,
+    channels: list[int],
+    layout: Layout,
+    speed_m_s: float,
+) -> Finding | None:
+    """Return a finding if a sound that is the same in each channel fits no wavefront, or with opposite signs only."""
+    positions_m, delay_s = layout.positions_m[channels], layout.delay_s[channels]
+    echo = fit_delays(times_s, positions_m, (0.0, 1 / path_m, 2 / path_m), speed_m_s)
+    if echo is None:
+        return None
+    fit = max(fit_emitter(times_s, positions_m, speed_m_s), echo, key=lambda each: (each.share, -each.spread_s))
+    heard = _gated(found, times_s + delay_s)
+    same = np.abs(heard @ np.linalg.svd(heard, full_matrices=False)[2][0].conj())
+    n_others = _n_others(found, times_s + delay_s, np.linalg.norm(positions_m, axis=1).max() / speed_m_s)
+    if np.quantile(same, 0.1) < _ONE_SOUND or n_others > _MAX_OTHERS * len(channels):
+        return None
+    finding = Finding(fault=ORDER, channels=tuple(channels), measured=1e6 * fit.spread_s, limit=1e6 * MAX_DELAY_S)
+    residual_s = np.sort(np.abs(times_s - fit.delay_s))[: math.ceil((1 - _MAX_SUSPECTS) * len(channels))]
+    is_many = residual_s[-1] > MAX_DELAY_S or np.sqrt(np.mean(residual_s**2)) > _MISFIT_S
+    if is_many and is_misfit(times_s, positions_m, path_m, speed_m_s):
+        n_fit = np.count_nonzero(np.abs(times_s - fit.delay_s) < 2 * _MAX_SPREAD_S)
+        fits = f"one wavefront fits only {n_fit} of {len(channels)} channels"
+        return replace(finding, detail=f"{fits}, although all hear the same sharp sound")
+    if fit.share < 1 or fit.spread_s > _MAX_SPREAD_S:
+        return None
+    return _opposite_signs(_gated(found, fit.delay_s + delay_s), channels)
+
+
+def _opposite_signs(heard: NDArray[np.complex128], channels: list[int]) -> Finding | None:
+    """Return a finding if more channels than single faults explain have the opposite sign: signals (mic, step)."""
+    phasor = heard @ np.linalg.svd(heard, full_matrices=False)[2][0].conj()
+    squared = np.mean(phasor**2) / np.mean(np.abs(phasor) ** 2)
+    sign = np.sign((phasor * np.exp(-0.5j * np.angle(squared))).real)
+    few = -1.0 if sign.sum() >= 0 else 1.0
+    inverted = [channel for channel, each in zip(channels, sign, strict=True) if each == few]
+    if np.abs(squared) < _TWO_SIGNS or len(inverted) <= _MAX_SUSPECTS * len(channels):
+        return None
+    detail = f"{len(inverted)} of {len(channels)} channels have the opposite sign of the others"
+    return Finding(
+        fault=POLARITY, channels=tuple(inverted), measured=float(np.abs(squared)), limit=_TWO_SIGNS, detail=detail
+    )
+
+
+def _n_others(found: Compressed, at_s: NDArray[np.float64], reach_s: float) -> int:
+    """Return the number of channels that hear another echo of half of the amplitude within the reach of the array."""
+    half_s, _ = (steps * found.step_s for steps in half_gate(found, _LAG_S))
+    time_s = found.start_s + np.arange(found.envelope.shape[1]) * found.step_s
+    away_s, near = np.abs(time_s - at_s[:, None]), np.abs(time_s - np.median(at_s)) <= 2 * reach_s + 2 * half_s
+    other = np.where((away_s > half_s) & near, found.envelope, 0.0).max(axis=1)
+    return int(np.sum(other > 0.5 * np.where(away_s <= half_s, found.envelope, 0.0).max(axis=1)))
+
+
+def _gated(found: Compressed, at_s: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the signals around their times, with equal power: (mic, step) complex128."""
+    wide, (_, lags) = aligned(found, at_s, _LAG_S), half_gate(found, _LAG_S)
+    gated = wide[:, lags : wide.shape[1] - lags]
+    power = np.sum(np.abs(gated) ** 2, axis=1, keepdims=True)
+    return np.asarray(gated / np.sqrt(np.maximum(power, np.finfo(np.float64).tiny)))
 
 
 def by_wavefront(
@@ -163,14 +246,20 @@ def _shifts(emission_s: float, channels: Sequence[int], speed_m_s: float) -> lis
 
 
 def _loudest(
-    signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
+    signals: Callable[[int], NDArray[np.float32]],
+    channels: Sequence[int],
+    settings: Settings,
+    n_samples: int,
+    earliest_s: float,
 ) -> tuple[int, int]:
     """Return the slice from one call length before the strongest arrival at some microphones to two after it."""
     rate_hz, call = settings.recording.sample_rate_hz, settings.call
     length = round(call.duration_s * rate_hz)
     few = list(channels)[:: max(1, len(channels) // _PILOTS)]
     pilot = compress(signals, few, call, rate_hz=rate_hz, first=0, last=n_samples)
-    middle_s = pilot.start_s + int(np.argmax(np.median(pilot.envelope, axis=0))) * pilot.step_s
+    level = np.median(pilot.envelope, axis=0)
+    level[pilot.start_s + np.arange(len(level)) * pilot.step_s < earliest_s] = 0.0
+    middle_s = pilot.start_s + int(np.argmax(level)) * pilot.step_s
     middle = round((middle_s + call.start_s) * rate_hz)
     return max(0, middle - length), min(n_samples, middle + 2 * length)
 
@@ -274,75 +363,3 @@ def _moved(
         else:
             findings.append(measured)
     return findings
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Coherence:
-    """Correlation of real signals (mic,) with a reference: its highest value and lag, and the same by their powers."""
-
-    # `at_zero`, `negative` and `opposite`: the highest, the magnitude of the lowest, and the latter by the powers, at
-    # lags within 10 µs.
-
-    lag_s: NDArray[np.float64]
-    peak: NDArray[np.float64]
-    coherence: NDArray[np.float64]
-    at_zero: NDArray[np.float64]
-    negative: NDArray[np.float64]
-    opposite: NDArray[np.float64]
-
-
-def _halves(found: Compressed, lag_s: float) -> tuple[int, int]:
-    """Return half of the gate and the largest lag, both in steps."""
-    band_hz = found.frequency_hz[-1] - found.frequency_hz[0]
-    return max(4, round(_GATE_PERIODS / band_hz / found.step_s)), int(np.ceil(lag_s / found.step_s))
-
-
-def aligned(found: Compressed, at_s: NDArray[np.float64], lag_s: float) -> NDArray[np.complex128]:
-    """Return the complex baseband signal of each microphone around its time ``at_s``: (mic, step) complex128."""
-    half, n_steps = sum(_halves(found, lag_s)), found.envelope.shape[1]
-    steps = np.arange(-half, half + 1)
-    turned = found.bins * np.exp(2j * np.pi * found.frequency_hz * (at_s - found.origin_s)[:, None])
-    low_hz, centre_hz = found.frequency_hz[0], found.frequency_hz.mean()
-    signals = scipy.fft.ifft(turned, n_steps, axis=1)[:, steps % n_steps]
-    return np.asarray(signals * np.exp(2j * np.pi * (low_hz - centre_hz) * found.step_s * steps))
-
-
-def half_bands(found: Compressed) -> tuple[Compressed, Compressed]:
-    """Return the lower and the upper half of the band."""
-    middle = len(found.frequency_hz) // 2
-    lower = replace(found, bins=found.bins[:, :middle], frequency_hz=found.frequency_hz[:middle])
-    return lower, replace(found, bins=found.bins[:, middle:], frequency_hz=found.frequency_hz[middle:])
-
-
-def mean_of(wide: NDArray[np.complex128], found: Compressed, lag_s: float) -> NDArray[np.complex128]:
-    """Return the mean of the microphones within the gate, each normalised to equal power: (step,) complex128."""
-    _, lags = _halves(found, lag_s)
-    gated = wide[:, lags : wide.shape[1] - lags]
-    return np.asarray(np.mean(gated / np.sqrt(np.sum(np.abs(gated) ** 2, axis=1))[:, None], axis=0))
-
-
-def correlate(
-    wide: NDArray[np.complex128], reference: NDArray[np.complex128], found: Compressed, lag_s: float
-) -> Coherence:
-    """Return the correlations of microphones with a reference, at lags within ``± lag_s``."""
-    windows = sliding_window_view(wide, len(reference), axis=1)
-    product = windows @ np.conj(reference)
-    norm = np.sqrt(np.sum(np.abs(windows) ** 2, axis=2) * np.sum(np.abs(reference) ** 2))
-    _, lags = _halves(found, lag_s)
-    coarse_s = np.arange(-lags, lags + 1) * found.step_s
-    fine_s = np.arange(-lag_s, lag_s + _LAG_STEP_S / 2, _LAG_STEP_S)
-    carrier = np.exp(2j * np.pi * found.frequency_hz.mean() * fine_s)
-    real = np.stack([(np.interp(fine_s, coarse_s, row) * carrier).real for row in product])
-    norms = np.stack([np.interp(fine_s, coarse_s, row) for row in norm])
-    mics, best = np.arange(len(wide)), np.argmax(real, axis=1)
-    near = np.abs(fine_s) <= _NEAR_ZERO_S
-    lowest = np.argmin(real[:, near], axis=1)
-    negative = -real[:, near][mics, lowest]
-    return Coherence(
-        lag_s=fine_s[best],
-        peak=real[mics, best],
-        coherence=real[mics, best] / norms[mics, best],
-        at_zero=real[:, near].max(axis=1),
-        negative=negative,
-        opposite=negative / norms[:, near][mics, lowest],
-    )

@@ -153,14 +153,17 @@ def _matched_response(settings: Settings, n_fft: int) -> tuple[NDArray[np.int64]
 
 
 def _own_response(settings: Settings, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the gain of own filters without their delay of half of their length: (bin,) complex128."""
+    """Return the gain of own filters without their mean group delay: (bin,) complex128."""
     processing = settings.processing
     rate_hz = processing.filter_rate_hz or settings.signal_rate_hz
     gain: NDArray[np.complex128] = np.ones(len(frequency_hz), dtype=np.complex128)
     for taps in (processing.pre_filter, processing.post_filter):
         if taps:
             gain *= scipy.signal.freqz(taps, worN=frequency_hz, fs=rate_hz)[1]
-            gain *= np.exp(1j * math.pi * frequency_hz * (len(taps) - 1) / rate_hz)
+            _, passed = scipy.signal.freqz(taps, worN=8 * len(taps), whole=True)
+            _, delay = scipy.signal.freqz(np.arange(len(taps)) * taps, worN=8 * len(taps), whole=True)
+            samples = np.sum((delay * passed.conj()).real) / np.sum(np.abs(passed) ** 2)
+            gain *= np.exp(2j * math.pi * frequency_hz * samples / rate_hz)
     return gain
 
 
