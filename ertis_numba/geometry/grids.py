@@ -19,6 +19,9 @@ __all__ = ["MAX_DIRECTIONS", "PAPER_GRIDS", "Grid", "direction_grid", "grid_coun
 MAX_DIRECTIONS = 1_000_000
 """Maximum number of directions of a grid."""
 
+_WHOLE_DEG = 5.0  # Limits of grids are multiples of this, as a rule.
+_ROUNDED = 2e-3
+
 PAPER_GRIDS = {
     "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
     "1850": ("3d:1850", (-45.0, 45.0), (-45.0, 45.0)),
@@ -69,6 +72,7 @@ def direction_grid(processing: Processing) -> Grid:
     # `2d:N` is N azimuths at one elevation, `3d:N` N cells of equal area; 90, 1850 and 3000 are the paper's grids.
     name = processing.directions
     if not isinstance(name, str):
+        _require_degrees("processing.directions", np.asarray(name, dtype=np.float64))
         angles_rad = np.radians(np.asarray(name, dtype=np.float64))
         return Grid(angles_rad[:, 0].copy(), angles_rad[:, 1].copy())
     n_directions, named = grid_count(name), named_grid(processing)
@@ -112,6 +116,20 @@ def _equal_area_grid(
     return Grid(np.concatenate(azimuth_rad), np.concatenate(elevation_rad))
 
 
+def _require_degrees(name: str, angles: NDArray[np.float64]) -> None:
+    """Refuse directions (direction, 2) whose limits are whole degrees only if they are read as radians."""
+    limits = np.abs([angles.min(axis=0), angles.max(axis=0)]).ravel()
+    limits = limits[limits > 0]
+    steps = np.degrees(limits) / _WHOLE_DEG
+    is_whole = np.abs(steps - np.round(steps)) < _ROUNDED
+    is_odd = np.abs(100 * limits % 1 - 0.5) < 0.49  # more than two decimals
+    if len(limits) and limits.max() < np.pi + _ROUNDED and (is_whole & is_odd).all():
+        raise ArgumentError(
+            f"{name}: angles up to {limits.max():.5g} are {np.degrees(limits.max()):.5g} degrees as radians; write "
+            "azimuth, elevation in degrees"
+        )
+
+
 def _csv_grid(path: str) -> Grid:
     if Path(path).suffix.lower() != ".csv":
         raise ArgumentError(
@@ -131,6 +149,7 @@ def _csv_grid(path: str) -> Grid:
         )
     angles_rad = np.radians(np.asarray(rows))
     checks.finite_array(f"directions {path}", angles_rad)
+    _require_degrees(f"directions {path}", np.asarray(rows))
     for row, (azimuth_deg, elevation_deg) in enumerate(rows):
         checks.between(f"directions {path}: azimuth in row {row}", azimuth_deg, -360.0, 360.0)
         checks.between(f"directions {path}: elevation in row {row}", elevation_deg, -90.0, 90.0)

@@ -285,7 +285,8 @@ def is_misfit(times_s: NDArray[np.float64], positions_m: NDArray[np.float64], pa
         return False
     # E. B. Wilson and M. M. Hilferty, The distribution of chi-square, Proc. Natl. Acad. Sci. 17, 1931.
     share = 2 / (9 * best.n_spare)
-    return best.spread_s > _DELAY_SD_S * (1 - share + _UNLIKELY * math.sqrt(share)) ** 1.5
+    limit_s: float = _DELAY_SD_S * (1 - share + _UNLIKELY * math.sqrt(share)) ** 1.5
+    return best.spread_s > limit_s
 
 
 def _kept(n_mics: int, n_unknowns: int) -> int:

@@ -85,8 +85,8 @@ def _arrival(
     # An echo is examined, too: the direct sound arrives at opposite microphones of a ring or grid at once.
     earliest_s = float(arrival.times_s.max()) + _AFTER_DIRECT_S
     echo = _arrival_after(signals, channels, settings, n_samples, earliest_s)
-    is_wrong = echo is not None and echo.other is not None and echo.other.fault in (ORDER, POLARITY)
-    return replace(arrival, other=echo.other) if is_wrong else arrival
+    other = None if echo is None else echo.other
+    return arrival if other is None or other.fault not in (ORDER, POLARITY) else replace(arrival, other=other)
 
 
 def _arrival_after(
