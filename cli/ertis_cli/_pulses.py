@@ -62,16 +62,15 @@ def note_empty(n_empty: int, n_pulses: int, *, quiet: bool) -> None:
         options.note(f"{n_empty} of {pulses} carried no echo above the noise", quiet=quiet)
 
 
-def note_without_own_echo(counts: "Mapping[str, int]", n_pulses: int, *, quiet: bool) -> None:
+def note_without_own_echo(counts: "Mapping[str, int]", n_sensors: int, n_pulses: int, *, quiet: bool) -> None:
     """Print a note on sensors whose emission no echo proves, because the space ahead of them may not be empty."""
+    from ertis_numba.fusion.emissions import unproven_note
+
     if counts:
         pulses = options.counted(n_pulses, "pulse")
         each = ", ".join(f"{sensor} in {count} of {pulses}" for sensor, count in counts.items())
-        options.note(
-            f"no echo proves that these sensors emit: {each}; if an emitter is broken, obstacles ahead of it may be "
-            "missing",
-            quiet=quiet,
-        )
+        is_every = len(counts) == n_sensors and min(counts.values()) == n_pulses
+        options.note(unproven_note(each, is_every=is_every), quiet=quiet)
 
 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = False) -> "list[Any]":

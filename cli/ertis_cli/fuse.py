@@ -140,7 +140,7 @@ def _write_fused(
         _pulses.note_truth(truth, quiet=quiet)
         if (placed := truth.truth()) is not None:
             writer.note_truth(PLATFORM, placed)
-    warnings = _warn_of_echoes(counts, fuser.emitter_warning(), len(groups), quiet=quiet)
+    warnings = _warn_of_echoes(counts, fuser.emitter_warning(), len(by_name), len(groups), quiet=quiet)
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
@@ -174,7 +174,9 @@ class _FusedCounts:
         self.unshown.update(fused.without_own_echo)
 
 
-def _warn_of_echoes(counts: _FusedCounts, contradiction: str | None, n_pulses: int, *, quiet: bool) -> list[str]:
+def _warn_of_echoes(
+    counts: _FusedCounts, contradiction: str | None, n_sensors: int, n_pulses: int, *, quiet: bool
+) -> list[str]:
     """Print and return warnings of missing echoes; with wrong emitters, echoes only seem to be missing."""
     _pulses.note_empty(counts.empty, n_pulses, quiet=quiet)
     every = [_unheard(name, count, n_pulses) for name, count in counts.unheard.items()]
@@ -183,7 +185,7 @@ def _warn_of_echoes(counts: _FusedCounts, contradiction: str | None, n_pulses: i
         options.warn(text)
     if counts.empty < n_pulses and not contradiction:
         others = {name: count for name, count in counts.unshown.items() if name not in counts.unheard}
-        _pulses.note_without_own_echo(others, n_pulses, quiet=quiet)
+        _pulses.note_without_own_echo(others, n_sensors, n_pulses, quiet=quiet)
     return warnings
 
 
@@ -216,7 +218,10 @@ def _direct_sound(check: "DirectSoundCheck") -> list[dict[str, Any]]:
 
 def _unheard(sensor: str, count: int, n_pulses: int) -> str:
     """Return a warning of a sensor whose call is not heard in some pulses."""
-    return f"no sensor hears the call of {sensor} in {count} of {n_pulses} pulses; check its emitter and its SYNC line"
+    return (
+        f"no sensor hears the call of {sensor} in {count} of {n_pulses} pulses; check its mounting, its emitter and "
+        "its SYNC line"
+    )
 
 
 def _require_several(readers: "Sequence[RecordingReader]") -> None:

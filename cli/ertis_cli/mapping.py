@@ -139,7 +139,7 @@ def mapping(
                 mapper.add(images.values(), trajectory)
                 truth.add(images, {name: place.index for name, place in group.items()})
     occupancy = mapper.map
-    warned = _warn(mapper, len(located), quiet=quiet)
+    warned = _warn(mapper, len(by_name), len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
     _pulses.note_truth(truth, quiet=quiet)
@@ -161,7 +161,7 @@ def mapping(
         options.print_json(report)
 
 
-def _warn(mapper: "Mapper", n_pulses: int, *, quiet: bool) -> list[str]:
+def _warn(mapper: "Mapper", n_sensors: int, n_pulses: int, *, quiet: bool) -> list[str]:
     """Report pulses and sensors without echoes, and return the warnings of wrong emitters and poses."""
     contradiction = mapper.emitter_warning()
     warned = [each for each in (contradiction, mapper.pose_warning()) if each]
@@ -169,7 +169,7 @@ def _warn(mapper: "Mapper", n_pulses: int, *, quiet: bool) -> list[str]:
         options.warn(each)
     _pulses.note_empty(mapper.n_empty, n_pulses, quiet=quiet)
     if mapper.n_empty < n_pulses and not contradiction:
-        _pulses.note_without_own_echo(mapper.without_own_echo, n_pulses, quiet=quiet)
+        _pulses.note_without_own_echo(mapper.without_own_echo, n_sensors, n_pulses, quiet=quiet)
     return warned
 
 

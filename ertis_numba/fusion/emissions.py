@@ -164,6 +164,15 @@ def is_much_better(length: int, other: int) -> bool:
     return other > _TIMES * length + _MORE
 
 
+def unproven_note(sensors: str, *, is_every: bool) -> str:
+    """Return a note of sensors whose emission no echo proves; if they are all, their sound may be of other sources."""
+    heard = "; the sound that they receive may come from another source, such as another robot" if is_every else ""
+    return (
+        f"no echo proves that these sensors emit: {sensors}; if an emitter is broken, obstacles ahead of it may be "
+        f"missing{heard}"
+    )
+
+
 def expected_echoes(
     reflectors: Reflectors,
     images: Mapping[int, Energyscape],

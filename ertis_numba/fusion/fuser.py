@@ -179,8 +179,9 @@ class Fuser:
         names = ("pistons", "omnidirectional emitters")
         right, wrong = names if other_m else names[::-1]
         return (
-            f"the echoes are those of {right}, but {wrong} are assumed; set "
-            f"emitter_diameter_m to {'their diameter' if other_m else '0'}"
+            "the echoes contradict the mountings or the emitters: they may be those of "
+            f"{right}, but {wrong} are assumed; first compare the name, position and angles of each sensor with the "
+            f"platform, and if all are right, set emitter_diameter_m to {'their diameter' if other_m else '0'}"
         )
 
     def has_tables(self, images: Iterable[Energyscape]) -> bool:

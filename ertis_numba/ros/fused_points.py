@@ -9,6 +9,7 @@ import numpy as np
 from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion import Fused, Fuser
+from ertis_numba.fusion.emissions import unproven_note
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
 
@@ -99,10 +100,8 @@ class FusedImages:
             return
         unshown, count = frozenset(fused.without_own_echo), fused.stamp.sync_count
         if unshown - self._unshown:
-            self._note(
-                f"SYNC pulse {count}: no echo proves that these sensors emit: {', '.join(sorted(unshown))}; if an "
-                "emitter is broken, obstacles ahead of it may be missing"
-            )
+            note = unproven_note(", ".join(sorted(unshown)), is_every=unshown == {*fused.sensors})
+            self._note(f"SYNC pulse {count}: {note}")
         self._unshown = unshown
 
 

@@ -21,6 +21,7 @@ from ertis_numba.fusion.emissions import (
     is_proven,
     silent_one,
     suspect,
+    unproven_note,
 )
 from ertis_numba.ros.fused_points import FusedImages
 from ertis_numba.simulation import load_scene
@@ -299,3 +300,8 @@ def test_loud_echoes_that_no_other_call_explains_prove_an_emission(power, is_une
     reflectors.located = (SimpleNamespace(echo=np.array([1, 2]), emitter=np.array([0, 0])),)
     silent = SimpleNamespace(is_unexplained=np.array([True, is_unexplained, False]))
     assert reflectors.proves(0, silent) == expected
+
+
+@pytest.mark.parametrize("is_every", [False, True])
+def test_note_names_other_sources_of_sound_if_no_sensor_is_heard(is_every):
+    assert ("may come from another source" in unproven_note("left in 1 of 1 pulse", is_every=is_every)) == is_every

@@ -39,7 +39,8 @@ def test_wrong_kind_of_emitters_is_warned_of(diameter_m, other_m, stated):
     assert warning_of(pulse, diameter_m) is None
     text = warning_of(pulse, other_m)
     assert stated in text
-    assert text.endswith(f"; set emitter_diameter_m to {'their diameter' if diameter_m else '0'}")
+    assert text.startswith("the echoes contradict the mountings or the emitters")
+    assert text.endswith(f", and if all are right, set emitter_diameter_m to {'their diameter' if diameter_m else '0'}")
 
 
 @pytest.mark.parametrize("diameter_m", [0.0, 0.012])
@@ -81,7 +82,10 @@ def test_process_warns_of_wrong_emitters_and_of_a_dead_one(tmp_path):
     line = ["fuse", str(tmp_path / "rec.h5"), "--json", "-o", str(tmp_path / "fused.h5")]
     dead = json.loads(CliRunner().invoke(cli, [*line, "--emitter-diameter", "0"]).stdout)
     assert dead["unheard"] == {"front": 1}
-    assert "no sensor hears the call of front in 1 of 1 pulses; check its emitter and its SYNC line" in dead["warnings"]
+    assert (
+        "no sensor hears the call of front in 1 of 1 pulses; check its mounting, its emitter and its SYNC line"
+        in dead["warnings"]
+    )
     wrong = json.loads(CliRunner().invoke(cli, [*line, "--force"]).stdout)
     assert any(OMNIDIRECTIONAL in each for each in wrong["warnings"])
 
