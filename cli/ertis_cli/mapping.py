@@ -139,7 +139,7 @@ def mapping(
                 mapper.add(images.values(), trajectory)
                 truth.add(images, {name: place.index for name, place in group.items()})
     occupancy = mapper.map
-    warned = _warn(mapper, len(by_name), len(located), quiet=quiet)
+    warned, noted = _warn(mapper, len(by_name), len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
     _pulses.note_truth(truth, quiet=quiet)
@@ -153,7 +153,7 @@ def mapping(
         "empty": mapper.n_empty,
         "without_own_echo": mapper.without_own_echo,
         "simulated": placed is not None and target.suffix.lower() == ".h5",
-        "notes": list(trajectory.notes),
+        "notes": [*trajectory.notes, *noted],
         "warnings": [*pipelines.warnings, *warned],
     }
     options.say(_summary(target, len(located), report), quiet=quiet)
@@ -161,8 +161,8 @@ def mapping(
         options.print_json(report)
 
 
-def _warn(mapper: "Mapper", n_sensors: int, n_pulses: int, *, quiet: bool) -> list[str]:
-    """Report pulses and sensors without echoes, and return the warnings of wrong emitters and poses."""
+def _warn(mapper: "Mapper", n_sensors: int, n_pulses: int, *, quiet: bool) -> tuple[list[str], list[str]]:
+    """Report pulses and sensors without echoes, and return the warnings of wrong emitters and poses, and notes."""
     contradiction = mapper.emitter_warning()
     warned = [each for each in (contradiction, mapper.pose_warning()) if each]
     for each in warned:
@@ -170,7 +170,10 @@ def _warn(mapper: "Mapper", n_sensors: int, n_pulses: int, *, quiet: bool) -> li
     _pulses.note_empty(mapper.n_empty, n_pulses, quiet=quiet)
     if mapper.n_empty < n_pulses and not contradiction:
         _pulses.note_without_own_echo(mapper.without_own_echo, n_sensors, n_pulses, quiet=quiet)
-    return warned
+    noted = [each for each in (mapper.pose_note(),) if each]
+    for each in noted:
+        options.note(each, quiet=quiet)
+    return warned, noted
 
 
 def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *, quiet: bool) -> None:

@@ -144,6 +144,10 @@ class Mapper:
         """Return a warning if the echoes of some pulses contradict the motion of the trajectory, with likely causes."""
         return self._motion.warning()
 
+    def pose_note(self) -> str | None:
+        """Return the reason why the motion of the trajectory could not be compared with the echoes, if so."""
+        return self._motion.note()
+
     def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:
         """Add the images of one SYNC pulse.
 

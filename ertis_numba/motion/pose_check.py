@@ -1,8 +1,8 @@
 """Comparison of given poses with the motion that echoes show."""
 
 import math
-from collections.abc import Iterable
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +11,24 @@ from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Trajectory, is_passive
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.motion.odometry import Odometry
+from ertis_numba.motion.pose_residuals import N_ERRORS, Correction, HeardStep, PoseResiduals
 from ertis_numba.motion.velocity import Item, stamp_of
 
 __all__ = ["PoseCheck"]
 
-Floats = NDArray[np.float64]
-
-_MAX_WAYS: Final = 3
-_MAX_PULSES: Final = 32  # Pulses whose motion is computed.
+_MAX_PULSES: Final = 32  # Pulses in a row whose motion is computed.
+_BURST: Final = 5  # Later, only as many after 64, 128, 256, … pulses.
 _MIN_STEPS: Final = 4
-_LONG_M, _LONG_RAD, _LONG_STEPS = 0.3, math.radians(40.0), 15  # A way ends there.
-_SHORT_M, _SHORT_RAD = 0.1, math.radians(10.0)  # Shorter ways decide nothing.
+_MIN_SHARE: Final = 1 / 3  # of measured steps; if most are uncertain, the others may be wrong.
 _IDLE_M_S, _IDLE_RAD_S = 0.02, math.radians(2.0)  # Slower poses stand still.
-# Standard deviations of good poses: those of positions, headings and mountings, and of times relative to echoes.
-_POSE_SD_M, _POSE_SD_RAD, _POSE_SHARE = 0.02, math.radians(5.0), 0.2
-_LIMIT_SD: Final = 5.0
-_CAUSE_SD: Final = 2.0  # Poses without their fault agree that well.
+_FIRST_IDLE: Final = 8  # Poses that stand still are compared after as many pulses, in case they are frozen.
+_EQUAL: Final = 6.0  # Difference of normalised squares at which causes are about as likely.
+_NEAR: Final = 0.3  # Difference of the factors of a fit and of the mean speeds
+_SAME: Final = 0.1  # Difference of factors that units explain
+_LATE_S: Final = np.arange(-20, 21) / 10
+_MAX_LEVER_M: Final = 1.0  # Distance of a tracked point from the platform's origin
+_TINY: Final = 1e-9
+_NONE: Final = Correction()
 _UNITS: Final = {
     "centimetres": 1e2,
     "millimetres": 1e3,
@@ -34,21 +36,12 @@ _UNITS: Final = {
     "feet": 1 / 0.3048,
     "kilometres": 1e-3,
 }
-
-
-class _Way(NamedTuple):
-    """Way of a platform by its echoes and by its poses: x, y in m and yaw in rad, in its frame at the start."""
-
-    heard: Floats
-    sd: Floats  # of the difference of good poses
-    given: Floats
-    inverse: Floats  # by the inverse of the poses
-
-    def fits(self, given: Floats, limit_sd: float = _CAUSE_SD) -> bool:
-        """Return True if a way agrees with that of the echoes."""
-        apart = (given - self.heard) / self.sd
-        turn_sd = abs(math.remainder(given[2] - self.heard[2], 2 * math.pi)) / self.sd[2]
-        return bool(np.hypot(*apart[:2]) < limit_sd and turn_sd < limit_sd)
+_CHANGES: Final = {
+    "inverted, from world to platform": lambda place, yaw: (-place * np.exp(-1j * yaw), -yaw),
+    "mirrored, with y and yaw of the opposite sign": lambda place, yaw: (np.conj(place), -yaw),
+    "mirrored, with x and y swapped": lambda place, yaw: (1j * np.conj(place), yaw),
+    "turned the wrong way, with yaw of the opposite sign": lambda place, yaw: (place, -yaw),
+}
 
 
 class PoseCheck:
@@ -56,132 +49,140 @@ class PoseCheck:
 
     def __init__(self, mountings: Mountings) -> None:
         self._mountings = mountings
-        self._odometry: Odometry | None = None
-        self._times_ns: list[int] = []
-        self._ways: list[_Way] = []
-        self._n_pulses = 0
         self._poses: Trajectory | None = None
         self._last_ns: int | None = None
+        self._odometry: Odometry | None = None
+        self._steps: list[HeardStep] = []
+        self._n_tried, self._n_moving, self._n_idle = 0, 0, 0
+        self._contradiction: str | None = None
 
     def add(self, group: Iterable[Item], poses: Trajectory) -> None:
         """Add the images of the next pulse."""
-        if self._n_pulses >= _MAX_PULSES or len(self._ways) >= _MAX_WAYS:
-            return
         items = [item for item in group if not is_passive(item.settings, item.stamp)]
         if not items:
             return
         if poses is not self._poses:
-            self._end()
-            self._poses, self._last_ns = poses, None
+            self._contradiction = self.warning()
+            self._begin(poses)
         time_ns = stamp_of({item.stamp.sensor: item for item in items}).timestamp_ns
         before_ns, self._last_ns = self._last_ns, time_ns
         try:
-            if before_ns is not None and _stands(poses, before_ns, time_ns):
-                self._end()
+            if before_ns is not None and not self._is_chosen(poses, before_ns, time_ns):
+                self._odometry = None
                 return
-            self._n_pulses += 1
             if self._odometry is None:
-                self._begin(items, time_ns)
+                self._odometry = Odometry(self._mountings)
+                self._odometry.add(items)
                 return
-            self._odometry.add(items)
+            found = self._odometry.add(items)
         except ErtisError:  # Echoes that odometry cannot use do not speak against the poses.
             self._odometry = None
             return
-        if not self._odometry.poses[-1].is_measured:
-            self._end()
-            self._begin(items, time_ns)
-            return
-        self._times_ns.append(time_ns)
-        last = self._odometry.poses[-1]
-        is_far = math.hypot(last.x_m, last.y_m) > _LONG_M or abs(last.yaw_rad) > _LONG_RAD
-        if (is_far and len(self._times_ns) > _MIN_STEPS) or len(self._times_ns) > _LONG_STEPS:
-            self._end()
+        self._n_tried += 1
+        if found is not None and before_ns is not None:
+            twist = np.array([*found.velocity_m_s, found.yaw_rate_rad_s])
+            self._steps.append(HeardStep(before_ns, time_ns, twist, found.covariance))
 
     def warning(self) -> str | None:
-        """Return a warning if most ways contradict the poses, with the likely cause."""
-        self._end()
-        wrong = [way for way in self._ways if not way.fits(way.given, _LIMIT_SD)]
-        if len(wrong) <= len(self._ways) / 2:
+        """Return a warning if the echoes contradict the poses, with the likely cause."""
+        if self._contradiction or self._poses is None or len(self._steps) < self._n_needed:
+            return self._contradiction
+        compared = PoseResiduals(self._steps, self._poses)
+        if not compared.contradicts():
             return None
-        first = wrong[0]
+        worst = compared.worst()
+        time_s = self._steps[worst].before_ns / 1e9
         return (
-            f"the echoes show a motion of {_text(first.heard)}, but the poses one of {_text(first.given)}, in "
-            f"{len(wrong)} of {len(self._ways)} parts of the path that were compared; {_cause(wrong)}"
+            f"the echoes contradict the poses: at {time_s:.3f} s, they show {_text(compared.heard[worst])}, but the "
+            f"poses {_text(compared.given()[worst])} ({len(self._steps)} steps compared); {_cause(compared)}"
         )
 
-    def _begin(self, items: list[Item], time_ns: int) -> None:
-        self._odometry, self._times_ns = Odometry(self._mountings), [time_ns]
-        self._odometry.add(items)
+    def note(self) -> str | None:
+        """Return the reason why moving poses could not be compared with the echoes, if so."""
+        if not self._n_moving or self.warning():
+            return None
+        if len(self._steps) < self._n_needed:
+            reason = (
+                f"they show the motion in {len(self._steps)} of {self._n_tried} steps, and {self._n_needed} are needed"
+            )
+        elif self._poses is None or PoseResiduals(self._steps, self._poses).shows_motion():
+            return None
+        else:
+            reason = "the motion is smaller than the errors of echoes and poses"
+        return f"the poses were not compared with the echoes: {reason}"
 
-    def _end(self) -> None:
-        """Keep the way of the echoes so far, if it is long enough."""
-        found, self._odometry = self._odometry, None
-        if found is None or self._poses is None or len(self._times_ns) <= _MIN_STEPS:
-            return
-        last = found.poses[len(self._times_ns) - 1]
-        heard = np.array([last.x_m, last.y_m, last.yaw_rad])
-        given, inverse, variance = _ways(self._poses, self._times_ns[0], self._times_ns[-1])
-        length = np.array([*(2 * [np.hypot(*heard[:2])]), abs(heard[2])])
-        if not any(_is_long(way) for way in (heard, given)):
-            return
-        good = np.array([_POSE_SD_M, _POSE_SD_M, _POSE_SD_RAD])
-        variance = variance + np.diag(last.covariance) + good**2 + (_POSE_SHARE * length) ** 2
-        self._ways.append(_Way(heard, np.sqrt(variance), given, inverse))
+    @property
+    def _n_needed(self) -> int:
+        """Measured steps that a comparison needs."""
+        return max(_MIN_STEPS, math.ceil(_MIN_SHARE * self._n_tried))
 
+    def _begin(self, poses: Trajectory) -> None:
+        """Forget the steps of other poses."""
+        self._poses, self._last_ns, self._odometry, self._steps = poses, None, None, []
+        self._n_tried, self._n_moving, self._n_idle = 0, 0, 0
 
-def _stands(poses: Trajectory, before_ns: int, time_ns: int) -> bool:
-    """Return True if the poses stand still between two times."""
-    time_s = (time_ns - before_ns) / 1e9
-    given, *_ = _ways(poses, before_ns, time_ns)
-    return bool(np.hypot(*given[:2]) < _IDLE_M_S * time_s and abs(given[2]) < _IDLE_RAD_S * time_s)
-
-
-def _is_long(way: Floats) -> bool:
-    return bool(np.hypot(*way[:2]) > _SHORT_M or abs(way[2]) > _SHORT_RAD)
-
-
-def _ways(poses: Trajectory, begin_ns: int, end_ns: int) -> tuple[Floats, Floats, Floats]:
-    """Return the way between two times by the poses and by their inverse, and the variance of both poses."""
-    both = poses.at([begin_ns, end_ns])
-    x, y, z, w = both.rotation_xyzw.T
-    yaw = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-    place = both.position_m[:, 0] + 1j * both.position_m[:, 1]
-    ways = []
-    for place_m, yaw_rad in ((place, yaw), (-place * np.exp(-1j * yaw), -yaw)):
-        moved = (place_m[1] - place_m[0]) * np.exp(-1j * yaw_rad[0])
-        ways.append(np.array([moved.real, moved.imag, math.remainder(yaw_rad[1] - yaw_rad[0], 2 * math.pi)]))
-    variance = np.zeros(3)
-    if both.covariance is not None:
-        of_both = np.trace(both.covariance.sum(axis=0)[:2, :2]), both.covariance[:, 5, 5].sum()
-        variance = np.array([of_both[0], of_both[0], of_both[1]])
-    return ways[0], ways[1], variance
+    def _is_chosen(self, poses: Trajectory, before_ns: int, time_ns: int) -> bool:
+        """Return True for most of the first pulses while the poses move, and for few others."""
+        ends, time_s = poses.at([before_ns, time_ns]), (time_ns - before_ns) / 1e9
+        way_m = np.linalg.norm(np.diff(ends.position_m, axis=0))
+        turn_rad = 2 * math.acos(min(1.0, abs(float(ends.rotation_xyzw[0] @ ends.rotation_xyzw[1]))))
+        if way_m < _IDLE_M_S * time_s and turn_rad < _IDLE_RAD_S * time_s:
+            self._n_idle += 1
+            return self._n_idle >= _FIRST_IDLE and _begins(self._n_idle)
+        self._n_moving += 1
+        return self._n_moving < _MAX_PULSES or _begins(self._n_moving)
 
 
-def _cause(ways: list[_Way]) -> str:
-    """Return the likely causes of wrong ways, as a clause with the remedy."""
-    found = ["inverted, from world to platform"] if all(way.fits(way.inverse) for way in ways) else []
-    for unit, per_m in _UNITS.items():
-        if all(way.fits(way.given / (per_m, per_m, 1)) for way in ways):
-            found.append(f"in {unit}")
-    for text, turn_deg in (("90° too large", 90), ("90° too small", -90), ("180° off", 180)):
-        turn = np.exp(1j * math.radians(turn_deg))
-        if all(way.fits(_with_place(way.given, turn * _place(way.given))) for way in ways):
-            found.append(f"{text} in yaw (or the mounting is, the other way)")
-    if all(way.fits(way.given * (1, -1, -1)) for way in ways):
-        found.append("mirrored, with y and yaw of the opposite sign")
-    if found:
-        return f"the poses may be {', or '.join(found)}; correct them"
-    return "correct the poses, their times or the mounting, or ignore this if most things around move"
+def _begins(number: int) -> bool:
+    """Return True for the first numbers after each power of two."""
+    return number - (1 << (number.bit_length() - 1)) < _BURST
 
 
-def _place(way: Floats) -> complex:
-    return complex(way[0], way[1])
+def _cause(compared: PoseResiduals) -> str:
+    """Return the likely causes of a contradiction, as a clause with the remedy."""
+    tried = [(Correction(change=change), text) for text, change in _CHANGES.items()] + list(_constant(compared))
+    found = [(compared.square(by), text) for by, text in tried if not compared.contradicts(by)]
+    given = compared.given()
+    if not found and np.all(np.abs(given[:, 2]) < _IDLE_RAD_S) and np.ptp(given[:, 0] + 1j * given[:, 1]):
+        found = [(0.0, "without the turns of the platform")]
+    if not found:
+        return "correct the poses, their times or the mounting, or ignore this if most things around move"
+    least = min(square for square, _ in found)
+    texts = [text for square, text in sorted(found) if square < least + _EQUAL]
+    return f"the poses may be {', or '.join(texts)}; correct them"
 
 
-def _with_place(way: Floats, place: complex) -> Floats:
-    return np.array([place.real, place.imag, way[2]])
+def _constant(compared: PoseResiduals) -> Iterator[tuple[Correction, str]]:
+    """Yield corrections of constant errors, and their descriptions."""
+    heard, given = ((each[:, 0] + 1j * each[:, 1], each[:, 2]) for each in (compared.heard, compared.given()))
+
+    def fitted(number: int, start: float) -> tuple[Correction, float]:
+        by = compared.fitted(Correction(start * np.eye(N_ERRORS)[number]), [number])
+        return by, float(by.errors[number])
+
+    slower = (np.abs(heard[0]).sum() + _TINY) / (np.abs(given[0]).sum() + _TINY)
+    by, log_scale = fitted(0, math.log(slower))
+    factor = math.exp(-log_scale)
+    units = [unit for unit, per_m in _UNITS.items() if abs(factor / per_m - 1) < _SAME]
+    if abs(factor * slower - 1) < _NEAR:  # No scale turns other motions into rest.
+        yield by, f"in {units[0]}" if units else f"too large by a factor of {factor:.2g}"
+    by, turn = fitted(1, float(np.angle(np.vdot(heard[0], given[0]))))
+    turn_deg = math.degrees(math.remainder(turn, 2 * math.pi))
+    way = f"{abs(turn_deg):.0f}° too {'small' if turn_deg > 0 else 'large'}" if abs(turn_deg) < 170 else "180° off"
+    yield by, f"{way} in yaw (or the mounting is, the other way)"
+    ratio = float(given[1] @ heard[1]) / (float(given[1] @ given[1]) + _TINY)
+    if ratio > 0:
+        by, log_turn = fitted(2, math.log(ratio))
+        yield by, f"turned too far by a factor of {math.exp(-log_turn):.2g}"
+    trials = [Correction(late_s * np.eye(N_ERRORS)[3]) for late_s in _LATE_S]
+    by, late_s = fitted(3, float(min(trials, key=compared.square).errors[3]))
+    yield by, f"{abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}"
+    by = compared.fitted(_NONE, [4, 5])
+    ahead_m, left_m = (-by.errors[4:]).tolist()
+    if math.hypot(ahead_m, left_m) < _MAX_LEVER_M:
+        yield by, f"those of a point {ahead_m:+.2f} m ahead and {left_m:+.2f} m to the left of the platform's origin"
 
 
-def _text(way: Floats) -> str:
-    x_m, y_m, yaw_rad = way.tolist()
-    return f"{x_m:+.2f} m ahead, {y_m:+.2f} m to the left and {math.degrees(yaw_rad):+.0f}°"
+def _text(twist: NDArray[np.float64]) -> str:
+    ahead_m_s, left_m_s, yaw_rad_s = twist.tolist()
+    return f"{ahead_m_s:+.2f} m/s ahead, {left_m_s:+.2f} m/s to the left and {math.degrees(yaw_rad_s):+.0f}°/s"

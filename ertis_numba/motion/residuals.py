@@ -26,7 +26,7 @@ class EchoPairs(NamedTuple):
     after: NDArray[np.int64]
 
 
-def twist_of(displacement: Floats, time_s: float) -> Floats:
+def twist_of(displacement: Floats, time_s: float | Floats) -> Floats:
     """Return the constant twists, forward, left and yaw per second, that produce displacements: (..., 3)."""
     x, y, yaw = np.moveaxis(displacement, -1, 0)
     half = yaw / 2

@@ -413,3 +413,12 @@ def test_map_whose_scale_contradicts_its_cells_is_refused(tmp_path, name, value)
         file.attrs["content_sha256"] = hashlib.sha256(variables.digest() + packed).hexdigest()
     with pytest.raises(ertis.ErtisError, match="cell_m or origin_x_m contradicts the positions of the cells"):
         ertis.read_map(path)
+
+
+def test_map_notes_poses_that_it_could_not_compare_with_the_echoes(folder):
+    moving = poses().replace(position_m=[[10.0, 0.0, 0.0], [10.5, 0.0, 0.0]])
+    ertis.write_tum(folder / "moving.tum", moving)
+    done = run(folder, "both.h5 --poses moving.tum --json -o moving.h5")
+    note = "the poses were not compared with the echoes: they show the motion in "
+    assert f"note: {note}" in done.stderr
+    assert any(each.startswith(note) for each in json.loads(done.stdout)["notes"])

@@ -7,7 +7,8 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.motion.odometry import Odometry
-from ertis_numba.motion.pose_check import PoseCheck
+from ertis_numba.motion.pose_check import PoseCheck, _cause
+from ertis_numba.motion.pose_residuals import HeardStep, PoseResiduals
 from tests.motion.test_ego_motion import MOUNTINGS, TIME_NS, places_m, seen_from
 
 N_PULSES = 7
@@ -25,14 +26,19 @@ def trajectory(place, yaw_rad):
     )
 
 
-def warning(given, *, count=40, moves=True):
+def warning(given, **options):
     """Return the warning of a check of poses by reflectors at rest, seen from the true path."""
+    return checked(given, **options).warning()
+
+
+def checked(given, *, count=40, moves=True):
+    """Return a check of poses by reflectors at rest, seen from the true path."""
     check = PoseCheck(MOUNTINGS)
     for pulse in range(N_PULSES):
         at = pulse if moves else 0
         pose = PATH[at].real, PATH[at].imag, YAW_RAD[at]
         check.add([seen_from(pose, places_m(count=count), pulse)], given)
-    return check.warning()
+    return check
 
 
 def test_true_poses_are_accepted():
@@ -57,7 +63,7 @@ def test_true_poses_are_accepted():
 )
 def test_wrong_poses_are_named(place, yaw_rad, cause):
     found = warning(trajectory(place, yaw_rad))
-    assert "in 1 of 1 parts of the path that were compared" in found
+    assert f"({N_PULSES - 1} steps compared)" in found
     assert cause in found
 
 
@@ -65,8 +71,19 @@ def test_motion_without_a_known_cause_is_a_contradiction():
     assert "correct the poses, their times or the mounting" in warning(trajectory(PATH * 2j, YAW_RAD))
 
 
-def test_echoes_that_show_no_motion_say_nothing():
-    assert warning(trajectory(100 * PATH, YAW_RAD), count=1) is None
+def test_echoes_that_show_no_motion_are_named_instead_of_compared():
+    check = checked(trajectory(100 * PATH, YAW_RAD), count=1)
+    assert check.warning() is None
+    wanted = "the poses were not compared with the echoes: they show the motion in 0 of 6 steps, and 4 are needed"
+    assert check.note() == wanted
+    assert checked(trajectory(PATH, YAW_RAD)).note() is None
+
+
+def test_motions_below_the_errors_of_the_poses_are_not_compared():
+    uncertain = trajectory(PATH, YAW_RAD).replace(covariance=np.tile(np.eye(6), (N_PULSES, 1, 1)))
+    check = checked(uncertain)
+    assert check.warning() is None
+    assert check.note().endswith("the motion is smaller than the errors of echoes and poses")
 
 
 def test_poses_that_stand_still_cost_nothing(monkeypatch):
@@ -78,3 +95,82 @@ def test_poses_that_stand_still_cost_nothing(monkeypatch):
         check.add([seen_from((1.0, 0.0, 0.0), places_m(), pulse)], given)
     assert len(added) == 1
     assert check.warning() is None
+
+
+def test_frozen_poses_are_found_later():
+    check = PoseCheck(MOUNTINGS)
+    given = trajectory(np.full(20, 1 + 0j), np.zeros(20))
+    for pulse in range(20):
+        check.add([seen_from((0.04 * pulse, 0.0, 0.0), places_m(), pulse)], given)
+    assert "the echoes contradict the poses" in check.warning()
+
+
+N_STEPS, STEP_S = 14, 0.125
+
+
+def drawn_steps(draws):
+    """Return measured steps on an arc of changing speed and yaw rate, and the times and poses of its path at 50 Hz."""
+    time_s = np.arange(-1.0, (N_STEPS + 8) * STEP_S, 0.02)
+    speed_m_s = draws.uniform(0.3, 1.0) * (1 + 0.4 * np.sin(2 * time_s + draws.uniform(0, 6)))
+    yaw_rad = np.cumsum(np.radians(60) * np.sin(1.5 * time_s + draws.uniform(0, 6))) * 0.02
+    place = np.cumsum(speed_m_s * np.exp(1j * yaw_rad)) * 0.02
+    steps, sd = [], np.array([0.015, 0.015, 0.025])
+    for number in range(N_STEPS):
+        at_s = STEP_S * np.array([number, number + 1])
+        begin, end = np.interp(at_s, time_s, place)
+        first_rad, last_rad = np.interp(at_s, time_s, yaw_rad)
+        middle_rad, half_rad = (first_rad + last_rad) / 2, (last_rad - first_rad) / 2
+        way = (end - begin) * np.exp(-1j * middle_rad) / np.sinc(half_rad / np.pi)
+        twist = np.array([way.real, way.imag, last_rad - first_rad]) / STEP_S
+        ends_ns = (int(each * 1e9) for each in at_s)
+        if draws.uniform() < 0.8:
+            steps.append(HeardStep(*ends_ns, twist + draws.normal(0, sd), np.diag(sd**2)))
+    return steps, time_s, place, yaw_rad
+
+
+def timed(time_s, place, yaw_rad):
+    given = trajectory(place, yaw_rad)
+    return given.replace(time_ns=np.round(time_s * 1e9).astype(np.int64))
+
+
+def test_true_poses_with_usual_errors_are_rarely_accused():
+    accused = 0
+    for seed in range(200):
+        draws = np.random.default_rng([seed, 1])
+        steps, time_s, place, yaw_rad = drawn_steps(draws)
+        white = draws.normal(0, 0.01 * (seed % 2), (3, len(time_s)))
+        scale, heading, late_s = 1 + draws.normal(0, 0.02), draws.normal(0, 0.02), draws.normal(0, 0.02)
+        noisy = place * scale + white[0] + 1j * white[1], yaw_rad + heading + white[2]
+        every = int(draws.choice([1, 5, 10]))
+        given = timed(time_s + late_s, *noisy)
+        thinned = timed(time_s[::every] + late_s, *(each[::every] for each in noisy))
+        accused += PoseResiduals(steps, thinned if seed % 3 else given).contradicts()
+    assert accused <= 2
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda time_s, place, yaw_rad: (time_s, 1j * place.conj(), yaw_rad), "with x and y swapped"),
+        (lambda time_s, place, yaw_rad: (time_s, 2 * place, yaw_rad), "too large by a factor of 2"),
+        (lambda time_s, place, yaw_rad: (time_s, place, 0 * yaw_rad), "without the turns of the platform"),
+        (lambda time_s, place, yaw_rad: (time_s + 0.5, place, yaw_rad), " s late"),
+        (lambda time_s, place, yaw_rad: (time_s, place + 0.4 * np.exp(1j * yaw_rad), yaw_rad), "those of a point +0."),
+        (lambda time_s, place, yaw_rad: (time_s, place, yaw_rad + 0.25), "° too large in yaw"),
+        (
+            lambda time_s, place, yaw_rad: (time_s, place, 1.5 * yaw_rad - 0.5 * yaw_rad[50]),
+            "turned too far by a factor of 1.",
+        ),
+        (lambda time_s, place, yaw_rad: (time_s, place, -yaw_rad), "yaw of the opposite sign"),
+    ],
+    ids=["swapped", "scale", "constant heading", "late", "lever", "heading", "turns", "sign of yaw"],
+)
+def test_contradictions_are_found_and_named(change, cause):
+    n_found = n_named = 0
+    for seed in range(8):
+        steps, *path = drawn_steps(np.random.default_rng([seed, 2]))
+        compared = PoseResiduals(steps, timed(*change(*path)))
+        n_found += (is_wrong := compared.contradicts())
+        n_named += is_wrong and cause in _cause(compared)
+    assert n_found >= 7
+    assert n_named >= 6
