@@ -244,8 +244,8 @@ class FusionTables:
                 counts = {number: each.counts for number, each in likely.items()}
                 found = silent_one(suspected, explained.counts, costs, counts)
         if found is not None and not self._is_omnidirectional:
-            each = rivals[found][1]
-            found = found if is_proven(found, each.expected, each.reflectors) else None
+            silent = rivals[found][1]
+            found = found if is_proven(found, silent.expected, silent.reflectors) else None
         return None if found is None else (found, *rivals[found])
 
     def emitters(self, group: Mapping[int, Energyscape]) -> frozenset[int]:
