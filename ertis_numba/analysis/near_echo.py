@@ -19,10 +19,12 @@ Floats = NDArray[np.float64]
 _NEAREST_M: Final = 0.2  # Nearer echoes overlap the direct sound of the emitter.
 _STEP_M: Final = 0.004
 _BESIDE_M: Final = 0.06  # Distance from the direct sound of other sensors, and from the first range.
-_OFF_AXIS_DEG: Final = np.arange(-40.0, 40.1, 5.0)
+_ANGLES_DEG: Final = np.arange(-65.0, 65.1, 5.0)
+_AHEAD_DEG: Final = 40.0  # Echoes from farther beside, such as those of the floor, are no obstacles ahead.
 _OVERSAMPLING: Final = 4
 _COHERENT: Final = 0.5  # Share of the power of all microphones that a beam towards an echo contains.
 _DIRECT: Final = 0.03  # Amplitude relative to the direct sound that its side lobes do not reach.
+_OTHER: Final = 0.1  # The same of other sensors, whose side lobes are nearer.
 _NOISE: Final = 8.0  # Amplitude relative to the median of the record.
 
 
@@ -48,14 +50,20 @@ def near_echo_m(measurement: Measurement, others_m: Collection[float] = ()) -> f
     path_m = (np.arange(len(power)) / rate_hz - start_s) * speed_m_s
     in_image = power[path_m >= 2 * (first_m - _BESIDE_M / 2)].max(initial=0.0)
     direct = power[path_m < 2 * _NEAREST_M].max(initial=0.0)
+    beside = np.abs(path_m[:, None] - np.array([*others_m])).min(axis=1, initial=np.inf) < 2 * _BESIDE_M
+    direct = max(direct, (_OTHER / _DIRECT) ** 2 * power[beside].max(initial=0.0))
     least = max(in_image, _DIRECT**2 * direct, _NOISE**2 * float(np.median(power)))
     sought = np.abs(path_m[:, None] / 2 - range_m).min(axis=1) < _STEP_M
     if power[sought].max(initial=0.0) <= least:  # A beam contains no more.
         return None
     beams, total = _beams(signals, layout.enabled_positions_m, range_m, rate_hz / speed_m_s, start_s * rate_hz)
-    beams = np.where((beams > _COHERENT * total) & (beams > least), beams, 0.0)
-    place = int(beams.max(axis=0).argmax())
-    return float(range_m[place]) if beams[:, place].any() else None
+    is_ahead = (np.abs(np.meshgrid(_ANGLES_DEG, _ANGLES_DEG)) <= _AHEAD_DEG).all(axis=0).ravel()
+    while beams.max() > least:
+        direction, place = np.unravel_index(beams.argmax(), beams.shape)
+        if is_ahead[direction] and beams[direction, place] > _COHERENT * total[direction, place]:
+            return float(range_m[place])
+        beams[:, np.abs(range_m - range_m[place]) < _BESIDE_M] = 0.0
+    return None
 
 
 def near_warning(sensor: str, range_m: float, first_m: float, *, is_alone: bool) -> str:
@@ -75,7 +83,7 @@ def _beams(
     spectra = np.zeros((len(signals), _OVERSAMPLING * count), np.complex64)
     spectra[:, : count // 2] = np.fft.fft(signals, axis=1)[:, : count // 2]
     fine = np.fft.ifft(spectra, axis=1) * _OVERSAMPLING
-    azimuth_rad, elevation_rad = np.radians(np.meshgrid(_OFF_AXIS_DEG, _OFF_AXIS_DEG)).reshape(2, -1)
+    azimuth_rad, elevation_rad = np.radians(np.meshgrid(_ANGLES_DEG, _ANGLES_DEG)).reshape(2, -1)
     beams, total = np.zeros((2, len(azimuth_rad), len(range_m)))
     for place, each_m in enumerate(range_m):
         # A wall reflects sound as if it came from the image of the emitter behind it; a post is nearer.
