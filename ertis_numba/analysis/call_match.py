@@ -45,6 +45,8 @@ _MIN_BINS: Final = 8  # Fewer are too few for pulse compression.
 _MAX_MICS: Final = 6
 _PADDING_S: Final = 5e-3
 _MAX_MEASUREMENTS: Final = 8
+_SCALED: Final = 0.25  # Largest difference of the scales of frequencies and of the duration.
+_LEAST_SCALE: Final = 0.03  # Natural logarithm of a scale of time.
 _MAX_SWEEP_HZ: Final = 190e3  # What fills the record up to 200 kHz is noise of modulators, or a click.
 _MIN_BANDWIDTH_HZ: Final = 12e3  # Bandwidth of a call that is no tone.
 
@@ -130,7 +132,7 @@ def _match(sound: SoundSpectra, call: Call) -> CallMatch:
     is_heard, curve = _is_heard(sound, call), curve_of(call)
     if is_heard and curve is None:
         found = find_sweep(sound)  # A waveform that was read with another sample rate is a longer or shorter call.
-        other = SILENT if found is None or found.sweep.high_hz > _MAX_SWEEP_HZ else _compared(sound, found, call)
+        other = SILENT if found is None or not _is_scaled(found.sweep, call) else _compared(sound, found, call)
         return CallMatch("matches") if other is SILENT else other
     judged = SILENT
     if is_heard and curve is not None:
@@ -143,6 +145,13 @@ def _match(sound: SoundSpectra, call: Call) -> CallMatch:
     if found is not None and found.sweep.high_hz <= _MAX_SWEEP_HZ:
         return _compared(sound, found, call)
     return judged
+
+
+def _is_scaled(sweep: Sweep, call: Call) -> bool:
+    """Return True if a sweep is about as the call, but with time and frequency on another scale."""
+    of_time = call.duration_s / max(sweep.duration_s, 1e-9)
+    scales = sweep.low_hz / call.low_frequency_hz, sweep.high_hz / call.high_frequency_hz, of_time
+    return max(scales) / min(scales) < 1 + _SCALED and abs(math.log(np.mean(scales))) > _LEAST_SCALE
 
 
 def _filter_rad(call: Call, sound: SoundSpectra, part: slice) -> NDArray[np.float64]:

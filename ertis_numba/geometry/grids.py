@@ -117,15 +117,14 @@ def _equal_area_grid(
 
 
 def _require_degrees(name: str, angles: NDArray[np.float64]) -> None:
-    """Refuse directions (direction, 2) whose limits are whole degrees only if they are read as radians."""
+    """Refuse directions (direction, 2) whose limits are multiples of 5° only if they are read as radians."""
     limits = np.abs([angles.min(axis=0), angles.max(axis=0)]).ravel()
     limits = limits[limits > 0]
-    steps = np.degrees(limits) / _WHOLE_DEG
-    is_whole = np.abs(steps - np.round(steps)) < _ROUNDED
-    is_odd = np.abs(100 * limits % 1 - 0.5) < 0.49  # more than two decimals
-    if len(limits) and limits.max() < np.pi + _ROUNDED and (is_whole & is_odd).all():
+    is_whole = np.abs(np.degrees(limits) / _WHOLE_DEG - np.round(np.degrees(limits) / _WHOLE_DEG)) < _ROUNDED
+    is_odd = np.abs(100 * limits - np.round(100 * limits)) > _ROUNDED  # more than two decimals
+    if len(limits) and limits.max() < 2 * np.pi + _ROUNDED and (is_whole & is_odd).all():
         raise ArgumentError(
-            f"{name}: angles up to {limits.max():.5g} are {np.degrees(limits.max()):.5g} degrees as radians; write "
+            f"{name}: angles up to {limits.max():.5g} are {np.degrees(limits.max()):.0f} degrees as radians; write "
             "azimuth, elevation in degrees"
         )
 

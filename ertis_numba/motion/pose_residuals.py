@@ -165,7 +165,7 @@ class PoseResiduals:
         first, last = np.searchsorted(time_s, at_s[[0, -1]])
         near = bends[max(0, first - 3) : last + 3]
         if poses.covariance is not None:
-            stated = np.trace(poses.covariance[:, :2, :2], axis1=1, axis2=2), poses.covariance[:, 5, 5]
+            stated = np.trace(poses.covariance[:, :2, :2], axis1=1, axis2=2) / 2, poses.covariance[:, 5, 5]
             noise = np.stack([np.interp(at_s, time_s, column) for column in stated], axis=1)
         elif len(near) < _MIN_POSES:
             noise = _UNKNOWN_SD**2

@@ -26,6 +26,8 @@ _POSSESSED: Final = {
 _ADJECTIVES: Final = {"inverted polarity": "inverted", "duplicate": "identical"}
 _IN_PAIRS: Final = ("swapped", "duplicate")
 _RECORDS: Final = {
+    "misfit of the array": "the order, the positions or the delays of channels are wrong",
+    "opposite signs": "channels have opposite signs",
     "order of channels": "channels are not in the order of the layout",
     "size of the array": "the positions of the microphones have another unit",
     "half late": "the channels of two converters are out of step",

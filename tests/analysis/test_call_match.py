@@ -74,6 +74,14 @@ def test_waveforms_of_another_sample_rate_are_reported(rate_hz, is_right, noise)
     assert (found.verdict == "matches", not found.warning) == (is_right, is_right)
 
 
+def test_waveforms_beside_a_louder_sweep_of_another_sensor_match():
+    other = CALL.replace(start_frequency_hz=90e3, stop_frequency_hz=60e3)
+    settings = SETTINGS.replace(call=sampled(450e3))
+    own, foreign = heard(CALL, noise=0.1, settings=settings), heard(other, echoes=((4e-3, 3.0),), settings=settings)
+    both = replace(own, data=own.data + foreign.data)
+    assert not call_match(both).warning
+
+
 def chirps(start_khz, stop_khz, duration_ms, method, *, echoes=((8e-3, 1.0),), noise=0.01, rate_hz=450e3):
     """Echoes of a chirp of SciPy at 6 microphones of an array, as 32-bit floats."""
     time_s = np.arange(round(0.025 * rate_hz)) / rate_hz

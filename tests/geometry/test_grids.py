@@ -8,7 +8,7 @@ from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Processing
 
 
-@pytest.mark.parametrize("largest_deg", [30, 45, 60, 90, 180])
+@pytest.mark.parametrize("largest_deg", [*range(5, 185, 5), 360])
 @pytest.mark.parametrize("decimals", [4, 6, None])
 def test_directions_in_radians_are_refused(tmp_path, largest_deg, decimals):
     azimuth_rad = np.radians(np.linspace(-largest_deg, largest_deg, 61))

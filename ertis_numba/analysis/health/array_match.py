@@ -18,12 +18,13 @@ from ertis_numba.analysis.health.report import Finding
 from ertis_numba.analysis.health.wave_shapes import CURVATURES, curved_m, fit_curved, places_of
 from ertis_numba.geometry import Layout, layout_names, load_layout
 
-__all__ = ["ARRAY_FAULTS", "POLARITY", "SIZE", "find_other_array", "is_misfit", "unobservable"]
+__all__ = ["ARRAY_FAULTS", "MISFIT", "SIGNS", "SIZE", "find_other_array", "is_misfit", "unobservable"]
 
 _HALF: Final = "half late"
-POLARITY: Final = "polarity of channels"
+SIGNS: Final = "opposite signs"
+MISFIT: Final = "misfit of the array"
 SIZE: Final = "size of the array"
-ARRAY_FAULTS: Final = frozenset({ORDER, POLARITY, _HALF, SIZE})
+ARRAY_FAULTS: Final = frozenset({MISFIT, ORDER, SIGNS, _HALF, SIZE})
 """Faults of the array as a whole."""
 
 _MAX_MICS_OF_ORDERS: Final = 16

@@ -41,8 +41,14 @@ KINDS = {
     "swapped": FaultKind(unit="µs", remedy=_LAYOUT),
     "late": FaultKind(unit="µs", remedy="set their delay (array.delay_s), or disable them in a layout file"),
     "order of channels": FaultKind(unit="µs", remedy=_LAYOUT, of_record=True),
-    "polarity of channels": FaultKind(
-        remedy="swap the wires of these channels or of the others, or invert them before importing", of_record=True
+    "misfit of the array": FaultKind(
+        unit="µs",
+        remedy="compare the order, the positions and the delays of the channels with the wiring",
+        of_record=True,
+    ),
+    "opposite signs": FaultKind(
+        remedy="swap the wires of these channels or of all others, or invert their samples before importing",
+        of_record=True,
     ),
     "size of the array": FaultKind(
         remedy="correct the unit of the positions, in the layout file or as array.positions_m", of_record=True

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.health.array_match import POLARITY, SIZE, find_other_array, is_misfit, unobservable
+from ertis_numba.analysis.health.array_match import MISFIT, SIGNS, SIZE, find_other_array, is_misfit, unobservable
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
 from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, half_gate, mean_of
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
@@ -15,6 +15,7 @@ from ertis_numba.analysis.health.levels import gain_findings
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
 from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, OF_ARRIVAL, ORDER, SINGLE_ECHO, NotObservable
 from ertis_numba.analysis.health.report import Finding
+from ertis_numba.base.units import runs
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
@@ -86,7 +87,7 @@ def _arrival(
     earliest_s = float(arrival.times_s.max()) + _AFTER_DIRECT_S
     echo = _arrival_after(signals, channels, settings, n_samples, earliest_s)
     other = None if echo is None else echo.other
-    return arrival if other is None or other.fault not in (ORDER, POLARITY) else replace(arrival, other=other)
+    return arrival if other is None or other.fault not in (MISFIT, ORDER, SIGNS) else replace(arrival, other=other)
 
 
 def _arrival_after(
@@ -142,13 +143,14 @@ def _misfit(
     n_others = _n_others(found, times_s + delay_s, np.linalg.norm(positions_m, axis=1).max() / speed_m_s)
     if np.quantile(same, 0.1) < _ONE_SOUND or n_others > _MAX_OTHERS * len(channels):
         return None
-    finding = Finding(fault=ORDER, channels=tuple(channels), measured=1e6 * fit.spread_s, limit=1e6 * MAX_DELAY_S)
     residual_s = np.sort(np.abs(times_s - fit.delay_s))[: math.ceil((1 - _MAX_SUSPECTS) * len(channels))]
-    is_many = residual_s[-1] > MAX_DELAY_S or np.sqrt(np.mean(residual_s**2)) > _MISFIT_S
-    if is_many and is_misfit(times_s, positions_m, path_m, speed_m_s):
-        n_fit = np.count_nonzero(np.abs(times_s - fit.delay_s) < 2 * _MAX_SPREAD_S)
-        fits = f"one wavefront fits only {n_fit} of {len(channels)} channels"
-        return replace(finding, detail=f"{fits}, although all hear the same sharp sound")
+    rms_s = float(np.sqrt(np.mean(residual_s**2)))
+    if rms_s > _MISFIT_S and is_misfit(times_s, positions_m, path_m, speed_m_s):
+        residuals = f"residuals of {1e6 * rms_s:.2g} µs in the best three quarters of the channels"
+        detail = f"no wavefront fits an echo that is sharp in all {len(channels)} channels, with {residuals}"
+        return Finding(
+            fault=MISFIT, channels=tuple(channels), measured=1e6 * rms_s, limit=1e6 * _MISFIT_S, detail=detail
+        )
     if fit.share < 1 or fit.spread_s > _MAX_SPREAD_S:
         return None
     return _opposite_signs(_gated(found, fit.delay_s + delay_s), channels)
@@ -163,9 +165,10 @@ def _opposite_signs(heard: NDArray[np.complex128], channels: list[int]) -> Findi
     inverted = [channel for channel, each in zip(channels, sign, strict=True) if each == few]
     if np.abs(squared) < _TWO_SIGNS or len(inverted) <= _MAX_SUSPECTS * len(channels):
         return None
-    detail = f"{len(inverted)} of {len(channels)} channels have the opposite sign of the others"
+    named = ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in runs(inverted))
+    detail = f"{len(inverted)} of {len(channels)} compared channels have the opposite sign of the others: {named}"
     return Finding(
-        fault=POLARITY, channels=tuple(inverted), measured=float(np.abs(squared)), limit=_TWO_SIGNS, detail=detail
+        fault=SIGNS, channels=tuple(inverted), measured=float(np.abs(squared)), limit=_TWO_SIGNS, detail=detail
     )
 
 
