@@ -104,6 +104,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench many --update docs/how-to/many.md
 	$(BIN)/ertis bench network --update docs/explanation/network-guarantees.md
 	$(BIN)/ertis bench latency --update docs/explanation/network-guarantees.md
+	$(BIN)/ertis bench capacity --update docs/explanation/capacity.md
 
 peers: $(VENV)/ready  ## compare with Acoular, PyTorch and JAX; on Linux, PyTorch from PyPI brings CUDA libraries
 	$(BIN)/python -m pip install --quiet --editable '.[peers]'

@@ -149,7 +149,7 @@ def _measured(
     ]
     groups = groups[wanted[0] : wanted[-1] + 1]
     with ExitStack() as stack:
-        pipelines = _pulses.PipelinesBySensor(_as_recorded, stack, quiet=quiet)
+        pipelines = _pulses.PipelinesBySensor(_as_recorded, stack, located=False, quiet=quiet)
         if any(reader.sensor not in known for reader in readers):
             known = _pulses.mountings_of(readers, None)
         found = odometry_of(readers, groups, pipelines, known, alone=alone, quiet=quiet).trajectory

@@ -237,6 +237,8 @@ def image_settings(settings_file: "Path | None", preset: str | None) -> "Callabl
 class PipelinesBySensor:
     """Pipelines by sensor, for the air of each measurement; ``warnings`` are those printed about the images."""
 
+    # `located` is True if a fusion locates the reflectors, with elevations in mind.
+
     def __init__(
         self,
         changed: "Callable[[Settings], Settings]",
@@ -245,8 +247,10 @@ class PipelinesBySensor:
         quiet: bool,
         without: "ExcludedChannels | None" = None,
         mountings: "Mapping[str, Mounting] | None" = None,
+        located: bool = True,
         **device: Any,
     ) -> None:
+        self._are_located = located
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._without = without
         self._near = _NearEchoes({} if mountings is None else mountings)
@@ -267,7 +271,7 @@ class PipelinesBySensor:
         if image.stamp.sensor not in self._checked:
             self._checked.add(image.stamp.sensor)
             options.note_unknown_places(image.stamp.sensor, image.settings, quiet=self._quiet)
-            options.note_height(image.settings, image, quiet=self._quiet)
+            options.note_height(image.settings, image, located=self._are_located, quiet=self._quiet)
             text = None if self._is_coarse else spacing_warning(image.settings, image)
             if text is not None:
                 self._is_coarse = True
@@ -309,12 +313,14 @@ class _NearEchoes:
     def __init__(self, mountings: "Mapping[str, Mounting]") -> None:
         self._mountings = mountings
         self._counts: Counter[str] = Counter()
+        self._delays_s: dict[str, float] = {}  # of calls, by sensor, as far as known
         self._found: set[str] = set()
 
     def warning(self, measurement: "Measurement | Energyscape", settings: "Settings") -> str | None:
         """Return a warning of an obstacle in front of a mounted sensor, or None."""
         from ertis_numba.analysis.near_echo import near_echo_m, near_warning
         from ertis_numba.frames import Measurement
+        from ertis_numba.geometry.air import sound_speed_m_s
 
         sensor = measurement.stamp.sensor
         if not isinstance(measurement, Measurement) or sensor not in self._mountings or sensor in self._found:
@@ -323,7 +329,14 @@ class _NearEchoes:
         if self._counts[sensor] % _NEAR_EVERY != 1:
             return None
         place_m = self._mountings[sensor][0]
-        others_m = [math.dist(place_m, other_m) for name, (other_m, _) in self._mountings.items() if name != sensor]
+        self._delays_s[sensor] = settings.call.delay_s
+        speed_m_s = sound_speed_m_s(settings.air)
+        others_m = [
+            math.dist(place_m, other_m)
+            + speed_m_s * (self._delays_s.get(name, settings.call.delay_s) - settings.call.delay_s)
+            for name, (other_m, _) in self._mountings.items()
+            if name != sensor
+        ]
         found_m = near_echo_m(replace(measurement, settings=settings), others_m)
         if found_m is None:
             return None

@@ -88,7 +88,7 @@ def odometry(
         mountings = _pulses.mountings_of(readers, mounting)
         changed = _pulses.image_settings(settings_file, preset)
         pipelines = _pulses.PipelinesBySensor(
-            changed, stack, quiet=quiet, mountings=mountings, device=device, threads=threads, plan=plan
+            changed, stack, quiet=quiet, mountings=mountings, located=False, device=device, threads=threads, plan=plan
         )
         active = _pulses.active_groups(readers, changed, quiet=quiet)
         found = odometry_of(readers, active.groups, pipelines, mountings, alone=alone or None, quiet=quiet)

@@ -449,7 +449,7 @@ def note_unknown_places(sensor: str, settings: "Settings", *, quiet: bool = Fals
         note(f"sensor {sensor} {text}", quiet=quiet)
 
 
-def note_height(settings: "Settings", grid: "DegreesFromRadians", *, quiet: bool = False) -> None:
+def note_height(settings: "Settings", grid: "DegreesFromRadians", *, located: bool = True, quiet: bool = False) -> None:
     """Print a note once if the directions of several sensors lie in the horizontal plane."""
     from ertis_numba.geometry import HEIGHT_NOTE, observable_angles
 
@@ -457,7 +457,8 @@ def note_height(settings: "Settings", grid: "DegreesFromRadians", *, quiet: bool
     if grid.elevation_rad.any() or not observable_angles(settings.array).elevation or "ertis_cli.height" in noted:
         return
     noted["ertis_cli.height"] = True
-    note(HEIGHT_NOTE, quiet=quiet)
+    each = "all directions have elevation 0°, so echoes from above or below the sensors count as those at their height"
+    note(HEIGHT_NOTE if located else each, quiet=quiet)
 
 
 def note_unknown_bearings(sensor: str, settings: "Settings") -> None:

@@ -29,9 +29,10 @@ _NOISE: Final = 8.0  # Amplitude relative to the median of the record.
 
 
 def near_echo_m(measurement: Measurement, others_m: Collection[float] = ()) -> float | None:
-    """Return the range of an echo from ahead that is stronger than all in the image; None without one.
+    """Return the range of an echo from ahead that is stronger than all echoes in the image; None without one.
 
-    ``others_m`` are the distances of other emitters, whose direct sound resembles echoes from half of the distance.
+    ``others_m`` are the paths of the direct sound of other emitters, which resembles echoes from half of the path. A
+    later call counts as a longer path.
     """
     settings = measurement.settings
     first_m, last_m = settings.processing.range_m
@@ -56,7 +57,8 @@ def near_echo_m(measurement: Measurement, others_m: Collection[float] = ()) -> f
     sought = np.abs(path_m[:, None] / 2 - range_m).min(axis=1) < _STEP_M
     if power[sought].max(initial=0.0) <= least:  # A beam contains no more.
         return None
-    beams, total = _beams(signals, layout.enabled_positions_m, range_m, rate_hz / speed_m_s, start_s * rate_hz)
+    begin = (start_s + layout.delay_s[layout.enabled]) * rate_hz
+    beams, total = _beams(signals, layout.enabled_positions_m, range_m, rate_hz / speed_m_s, begin)
     is_ahead = (np.abs(np.meshgrid(_ANGLES_DEG, _ANGLES_DEG)) <= _AHEAD_DEG).all(axis=0).ravel()
     while beams.max() > least:
         direction, place = np.unravel_index(beams.argmax(), beams.shape)
@@ -70,15 +72,17 @@ def near_warning(sensor: str, range_m: float, first_m: float, *, is_alone: bool)
     """Return a warning of an echo from before the first range."""
     other = "" if is_alone else ", perhaps of another sensor's call"
     return (
-        f"sensor {sensor}: an echo as from {range_m:.2g} m{other}, before the first range of {first_m:.2g} m; images "
-        "lack this obstacle, and space behind it may appear free. Start images nearer (processing.range_m, --range)"
+        f"sensor {sensor}: the strongest echo comes from {range_m:.2g} m{other}, before the first range of "
+        f"{first_m:.2g} m. Images do not show it, and space behind an obstacle there may appear free; start images "
+        "nearer (processing.range_m, --range)"
     )
 
 
 def _beams(
-    signals: NDArray[np.complex64], mics_m: Floats, range_m: Floats, samples_1_m: float, start: float
+    signals: NDArray[np.complex64], mics_m: Floats, range_m: Floats, samples_1_m: float, begin: Floats
 ) -> tuple[Floats, Floats]:
     """Return the powers of beams ahead, and those of all microphones at the same times: (direction, range) float64."""
+    # `begin` (mic,) is the sample at which the emission begins in each channel.
     count = signals.shape[1]
     spectra = np.zeros((len(signals), _OVERSAMPLING * count), np.complex64)
     spectra[:, : count // 2] = np.fft.fft(signals, axis=1)[:, : count // 2]
@@ -89,7 +93,7 @@ def _beams(
         # A wall reflects sound as if it came from the image of the emitter behind it; a post is nearer.
         source_m = 2 * each_m * unit_vectors(azimuth_rad, elevation_rad)
         path_m = np.linalg.norm(source_m[:, None] - mics_m, axis=2)
-        column = np.rint((start + path_m * samples_1_m) * _OVERSAMPLING).astype(np.int64).clip(0, fine.shape[1] - 1)
+        column = np.rint((begin + path_m * samples_1_m) * _OVERSAMPLING).astype(np.int64).clip(0, fine.shape[1] - 1)
         heard = fine[np.arange(len(mics_m)), column]
         beams[:, place] = np.abs(heard.mean(axis=1)) ** 2
         total[:, place] = np.mean(np.abs(heard) ** 2, axis=1)

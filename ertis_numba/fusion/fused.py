@@ -80,8 +80,8 @@ class Fused:
 
         Amplitudes are those that a single sensor would measure if the reflector were at 1 m on the axis of its emitter.
         Where the calls of two sensors arrive together, with unknown phases, they may be 3 dB too high, or up to 13 dB
-        too low where the calls cancel each other. If microphones are on a line, positions and uncertainties apply to
-        reflectors at the height of the sensors.
+        too low where the calls cancel each other. In planar images, positions are at the height of the sensors, and
+        uncertainties allow for elevations up to 12°.
         """
         return self._locate(self._solve())
 

@@ -1,6 +1,5 @@
 """Tables of fusion: receivers, pairs and hypotheses of all sensors of a platform."""
 
-import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -94,6 +93,7 @@ class FusionTables:
         self._sensors, self._emitting, self._start_s, self._diameters_m = sensors, emitting, start_s, diameters_m
         self._positions_m = grid.positions_m
         self._receivers: dict[int, Receiver] = {}
+        self._blind: tuple[tuple[int, ...], float] | None = None  # sensors heard, and the distance of `_blind_m`
         self._deaf: dict[int, NDArray[np.bool_]] = {}
         self._pairs: dict[int, list[Pair]] = {}
         self._hypotheses: dict[int, list[Hypothesis]] = {}
@@ -405,16 +405,19 @@ class FusionTables:
             deaf |= np.abs(range_m - (apart_m + delay_m) / 2) <= _DIRECT_SOUND_M
         return np.asarray(deaf)
 
-    @functools.cached_property
+    @property
     def _blind_m(self) -> float:
         """Distance from the origin within which reflectors may be nearer to a sensor than its image."""
-        # All images of a file have the same settings, so sensors without an image so far count like the first one.
-        first = next(iter(self._receivers))
-        known = [number if number in self._receivers else first for number in range(len(self._sensors))]
-        return max(
-            self._receivers[number].blind_m(self._deaf[number], sensor)
-            for number, sensor in zip(known, self._sensors, strict=True)
-        )
+        # A sensor without an image so far counts like the first one, until its images begin at another range.
+        heard = tuple(self._receivers)
+        if self._blind is None or self._blind[0] != heard:
+            known = [number if number in self._receivers else heard[0] for number in range(len(self._sensors))]
+            blind_m = max(
+                self._receivers[number].blind_m(self._deaf[number], sensor)
+                for number, sensor in zip(known, self._sensors, strict=True)
+            )
+            self._blind = heard, blind_m
+        return self._blind[1]
 
     def _fused_settings(self, settings: Settings) -> Settings:
         limit_deg = 180.0 - 180.0 / self.grid.n_azimuths

@@ -79,3 +79,16 @@ def test_fuse_names_the_sensor_and_the_range(tmp_path):
     done = CliRunner().invoke(cli, ["fuse", str(tmp_path / "rec.h5"), "--json"])
     warnings = [each for each in json.loads(done.stdout)["warnings"] if "before the first range" in each]
     assert warnings[0].startswith("sensor front: an echo as from 0.3 m, perhaps of another sensor's call, before the")
+
+
+def test_obstacle_is_found_by_microphones_with_known_delays():
+    """Delays of 20 µs, most of a period, which the layout states."""
+    delay_s = np.random.default_rng(3).uniform(-20e-6, 20e-6, len(microphones(SETTINGS.array).positions_m))
+    signals = signals_with([[FRONT_M + 0.3, 0.0, HEIGHT_M]])["front"]
+    frequency_hz = np.fft.rfftfreq(len(signals), 1 / RATE_HZ)[:, None]
+    late = np.fft.irfft(
+        np.fft.rfft(signals, axis=0) * np.exp(-2j * np.pi * frequency_hz * delay_s), len(signals), axis=0
+    )
+    measurement = measured({"front": late.astype(np.float32)})["front"]
+    stated = SETTINGS.replace(array=SETTINGS.array.replace(delay_s=tuple(delay_s.tolist())))
+    assert near_echo_m(replace(measurement, settings=stated), others_m("front")) == pytest.approx(0.3, abs=0.02)
