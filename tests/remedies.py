@@ -14,7 +14,7 @@ _NAMED = re.compile(r"ertis ([a-z-]+)")
 @functools.cache
 def options_of(name):
     """Options of a command and its subcommands."""
-    return frozenset(_options(cli.get_command(click.Context(cli), name))) | OF_ALL
+    return frozenset(_options(cli.get_command(click.Context(cli, **cli.context_settings), name))) | OF_ALL
 
 
 def _options(command):

@@ -29,6 +29,7 @@ __all__ = [
     "silence_ratios",
     "silent_one",
     "suspect",
+    "unproven_note",
 ]
 
 Floats = NDArray[np.float64]

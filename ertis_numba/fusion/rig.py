@@ -23,6 +23,7 @@ __all__ = [
     "MountedSensor",
     "Mountings",
     "emitter_diameter_m",
+    "far_apart",
     "mounted_sensors",
     "require_common_reach",
 ]
@@ -76,24 +77,33 @@ def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
     return tuple(sensors)
 
 
-def require_common_reach(sensors: Sequence[MountedSensor], last_m: float) -> None:
-    """Raise ArgumentError if a sensor is so far from all others that no reflector is within the range of two."""
-    if len(sensors) < 2:
-        return
-    places_m = np.array([sensor.translation_m for sensor in sensors])
-    apart_m = np.linalg.norm(places_m[:, None] - places_m, axis=2) + np.diag(np.full(len(sensors), np.inf))
+def far_apart(places_m: Mapping[str, Sequence[float]], last_m: float) -> tuple[str, str, float] | None:
+    """Return two sensors and their distance if no reflector is within the range of both, nor of one and another."""
+    if len(places_m) < 2:
+        return None
+    names, places = list(places_m), np.array(list(places_m.values()))
+    apart_m = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(len(names), np.inf))
     number = int(apart_m.min(axis=1).argmax())
     nearest_m = float(apart_m[number].min())
     # A call that one sensor emits and another receives has travelled at least the distance between both.
     if nearest_m <= 2 * last_m:
+        return None
+    one, other = sorted((number, int(apart_m[number].argmin())))
+    return names[one], names[other], nearest_m
+
+
+def require_common_reach(sensors: Sequence[MountedSensor], last_m: float) -> None:
+    """Raise ArgumentError if a sensor is so far from all others that no reflector is within the range of two."""
+    found = far_apart({sensor.name: sensor.translation_m.tolist() for sensor in sensors}, last_m)
+    if found is None:
         return
-    one, other = (sensors[each].name for each in sorted((number, int(apart_m[number].argmin()))))
-    unit, factor = ("centimetres", 100) if nearest_m < _LARGEST_M * 100 else ("millimetres", 1000)
-    likely = f"; if the file states {unit}, divide them by {factor}" if nearest_m < _LARGEST_M * factor else ""
+    one, other, apart_m = found
+    unit, factor = ("centimetres", 100) if apart_m < _LARGEST_M * 100 else ("millimetres", 1000)
+    likely = f"; if they are in {unit}, divide them by {factor}" if apart_m < _LARGEST_M * factor else ""
     raise ArgumentError(
-        f"sensors {one!r} and {other!r} are mounted {round(nearest_m, 2):g} m apart, but images reach {last_m:.3g} m, "
-        "so both observe no common reflector; correct the positions of the mountings, which are in metres"
-        f"{likely}, or use sensors of one platform"
+        f"sensors {one!r} and {other!r} are mounted {round(apart_m, 2):g} m apart, but images reach {last_m:.3g} m, so "
+        f"they observe no common reflector. Correct the positions of the mountings, in metres{likely}, or use sensors "
+        "of one platform"
     )
 
 

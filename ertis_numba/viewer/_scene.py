@@ -16,6 +16,7 @@ from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion import Fuser
 from ertis_numba.fusion.pulses import is_same_pulse
+from ertis_numba.fusion.rig import far_apart
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, Choices, colour_table
 from ertis_numba.viewer._polar import Polar, cropped, is_within
@@ -155,7 +156,7 @@ class ViewedScene:
         for each in kept.values():
             self._prepare(each, choices)
         joined = {name: each.latest for name, each in kept.items() if each in timely and not each.outside}
-        fused = len(joined) > 1 and all(_is_level(taken) for taken in joined.values())
+        fused = len(joined) > 1 and all(map(_is_level, joined.values())) and _share_reflectors(joined)
         sensors = {}
         for name, each in kept.items():
             overdue = now_s >= each.latest.due_s
@@ -229,6 +230,12 @@ def _cloud_of(cloud: PointCloud, time_s: float, pose: Pose) -> _Cloud:
 def _is_level(taken: ReceivedImage[Energyscape]) -> bool:
     """Return True if an image lies in the horizontal plane of a platform, and its pose is known."""
     return taken.pose is not None and taken.image.is_planar and is_level(taken.pose)
+
+
+def _share_reflectors(joined: Mapping[str, ReceivedImage[Energyscape]]) -> bool:
+    """Return True if the ranges of images of mounted sensors overlap."""
+    places_m = {name: taken.pose.translation_m for name, taken in joined.items() if taken.pose is not None}
+    return far_apart(places_m, max(float(taken.image.range_m[-1]) for taken in joined.values())) is None
 
 
 def _until_s(timely: list[_SensorImages], sensors: dict[str, Drawn], choices: Choices, now_s: float) -> float:

@@ -78,7 +78,7 @@ def test_fuse_names_the_sensor_and_the_range(tmp_path):
     write_recording(tmp_path / "rec.h5", [*found.values()], mounting=mounted(2))
     done = CliRunner().invoke(cli, ["fuse", str(tmp_path / "rec.h5"), "--json"])
     warnings = [each for each in json.loads(done.stdout)["warnings"] if "before the first range" in each]
-    assert warnings[0].startswith("sensor front: an echo as from 0.3 m, perhaps of another sensor's call, before the")
+    assert warnings[0].startswith("sensor front: the strongest echo comes from 0.3 m, perhaps of another sensor's call")
 
 
 def test_obstacle_is_found_by_microphones_with_known_delays():
@@ -90,5 +90,7 @@ def test_obstacle_is_found_by_microphones_with_known_delays():
         np.fft.rfft(signals, axis=0) * np.exp(-2j * np.pi * frequency_hz * delay_s), len(signals), axis=0
     )
     measurement = measured({"front": late.astype(np.float32)})["front"]
-    stated = SETTINGS.replace(array=SETTINGS.array.replace(delay_s=tuple(delay_s.tolist())))
+    positions_m = tuple(map(tuple, microphones(SETTINGS.array).positions_m.tolist()))
+    array = SETTINGS.array.replace(layout="delayed", positions_m=positions_m, delay_s=tuple(delay_s.tolist()))
+    stated = SETTINGS.replace(array=array)
     assert near_echo_m(replace(measurement, settings=stated), others_m("front")) == pytest.approx(0.3, abs=0.02)

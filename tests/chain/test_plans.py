@@ -125,7 +125,7 @@ def test_plan_beyond_its_budget_is_refused(recording, tmp_path):
     output, wishes = tmp_path / "a.h5", tmp_path / "wishes.toml"
     wishes.write_text(
         '[accuracy]\nprecision = "float32"\noversampling = 2\ndelay_taps = 1\n'
-        "beam_taps = 0\nbeam_density = 2.0\nstop_band_db = 60.0\nfocal_zones = 1\n",
+        "beam_taps = 0\nbeam_density = 2.0\nstopband_attenuation_db = 60.0\nfocal_zones = 1\n",
         "utf-8",
     )
     done = run(recording, "-o", output, "--settings", wishes, code=1)

@@ -235,7 +235,7 @@ def test_plot_overwrites_only_with_force(images, tmp_path):
 
 
 def test_every_command_and_option_has_help():
-    context = click.Context(cli)
+    context = click.Context(cli, **cli.context_settings)
     for name, (_, about) in COMMANDS.items():
         command = cli.get_command(context, name)
         assert command.name == name

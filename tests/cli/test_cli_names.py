@@ -146,7 +146,9 @@ def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
 )
 def test_keys_that_are_no_options_keep_their_names(given, message, stated):
     name, *given = given.split()
-    ctx = cli.get_command(click.Context(cli), name).make_context(name, ["a.h5", "-o", "b.h5", *given])
+    ctx = cli.get_command(click.Context(cli, **cli.context_settings), name).make_context(
+        name, ["a.h5", "-o", "b.h5", *given]
+    )
     assert _naming.named(message, ctx) == f"{stated} {message.partition(' ')[2]}"
 
 
@@ -172,7 +174,7 @@ def test_keys_that_are_no_options_keep_their_names(given, message, stated):
     ],
 )
 def test_with_options_replaces_parameters_but_no_paths(names, message, stated):
-    command, ctx = cli, click.Context(cli)
+    command, ctx = cli, click.Context(cli, **cli.context_settings)
     for name in names:
         command = command.get_command(ctx, name)
         ctx = click.Context(command, parent=ctx)

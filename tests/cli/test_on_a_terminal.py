@@ -248,7 +248,7 @@ def test_status_fits_a_terminal_of_80_columns():
 
 
 def test_help_describes_json_output():
-    context = click.Context(cli)
+    context = click.Context(cli, **cli.context_settings)
     about = {}
     for name in COMMANDS:
         command = cli.get_command(context, name)

@@ -38,8 +38,8 @@ USES = {
 @pytest.mark.parametrize(
     ("spacing_m", "remedy"),
     [
-        (40.0, "; if the file states centimetres, divide them by 100,"),
-        (283.0, "; if the file states millimetres, divide them by 1000,"),
+        (40.0, "; if they are in centimetres, divide them by 100,"),
+        (283.0, "; if they are in millimetres, divide them by 1000,"),
         (9000.0, "in metres, or use"),
     ],
 )

@@ -238,7 +238,7 @@ def test_recorded_view_fades_without_new_images(tmp_path):
 def test_files_contain_mountings(tmp_path, kind):
     given = noise(SMALL, 1)[0]
     several = [replace(given, stamp=replace(given.stamp, sensor=name)) for name in "ab"]
-    places = {"a": TURNED, "b": replace(TURNED, translation_m=(0.0, -1.0, 0.5))}
+    places = {"a": TURNED, "b": replace(TURNED, translation_m=(1.0, 1.0, 0.5))}
     mounting = {name: (pose.translation_m, pose.rotation_xyzw) for name, pose in places.items()}
     path = write_recording(tmp_path / "rec.h5", several, mounting=mounting)
     if kind == "energyscape":
@@ -316,3 +316,17 @@ def test_playback_starts_with_the_first_browser(tmp_path):
         view._page._greet(SimpleNamespace(client_id=0, gui=MagicMock()))  # noqa: SLF001  as a browser comes
         wait_for(lambda: view.run(duration_s=0.02) or not playback.playing)
         assert playback.received > 1
+
+
+def test_sensors_that_observe_no_common_reflector_are_drawn_alone(tmp_path):
+    given = noise(SMALL, 1)[0]
+    several = [replace(given, stamp=replace(given.stamp, sensor=name)) for name in "ab"]
+    mounting = {"a": ((0.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0)), "b": ((0.0, 9.0, 0.5), (0.0, 0.0, 0.0, 1.0))}
+    path = write_recording(tmp_path / "rec.h5", several, mounting=mounting)
+    with Playback(path, device="cpu") as playback:
+        scene = ViewedScene()
+        for each in playback.at(0):
+            scene.take(each)
+        frame = scene.draw(Choices())
+    assert frame.fused is None
+    assert all(drawn.shape is not None for drawn in frame.sensors.values())

@@ -105,7 +105,9 @@ def capacity(report: Found) -> str:
         cells.append((row["about"], f"{row['count']}", times, cpu, beyond))
     conditions = (
         f"Largest numbers that lasted {report['duration_s']:g} s without a loss, with p99 below {_LATEST_MS:g} ms, to "
-        f"within a tenth; trials of {_TRIAL_S:g} s found them. Measurements have 655 kB. Times are those from the last "
+        f"within a tenth; trials of {_TRIAL_S:g} s found them. Measurements have 655 kB. All sensors measure at the "
+        "same time. Measurements are late if p99 exceeds the limit, and superseded if a newer one of the same sensor "
+        "arrives before a worker is free. Times are those from the last "
         "byte at the sensor node to its acknowledgement, or to the image in an application. CURVE encryption over "
         "loopback: programs that stand for sensors, the central node and an application that checks every image share "
         "the cores, so a central node with its own cores sustains more."
