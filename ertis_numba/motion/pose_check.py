@@ -54,6 +54,7 @@ class PoseCheck:
         self._odometry: Odometry | None = None
         self._steps: list[HeardStep] = []
         self._n_tried, self._n_moving, self._n_idle = 0, 0, 0
+        self._n_unused = 0  # trajectories that gave no step
         self._contradiction: str | None = None
 
     def add(self, group: Iterable[Item], poses: Trajectory) -> None:
@@ -99,6 +100,9 @@ class PoseCheck:
 
     def note(self) -> str | None:
         """Return the reason why moving poses could not be compared with the echoes, if so."""
+        if self._n_unused >= _MIN_STEPS and not (self._steps or self.warning()):
+            reason = "nearly every pulse has a trajectory of its own; pass one that covers all pulses"
+            return f"the poses were not compared with the echoes: {reason}"
         if not self._n_moving or self.warning():
             return None
         if len(self._steps) < self._n_needed:
@@ -118,6 +122,7 @@ class PoseCheck:
 
     def _begin(self, poses: Trajectory) -> None:
         """Forget the steps of other poses."""
+        self._n_unused += self._poses is not None and not self._steps
         self._poses, self._last_ns, self._odometry, self._steps = poses, None, None, []
         self._n_tried, self._n_moving, self._n_idle = 0, 0, 0
 

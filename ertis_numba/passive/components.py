@@ -12,7 +12,7 @@ __all__ = ["gathered", "strongest_first"]
 
 def gathered(found: AcousticMap) -> AcousticMap:
     """Return a map of components, in which each source has one direction; other maps remain as they are."""
-    # From the strongest direction of a band on, the components of a direction and its neighbours are summed there.
+    # In each band, strongest direction first, a direction takes over the components of its neighbours.
     if not found.settings.passive.traits.is_sparse:
         return found
     neighbours = neighbours_of(unit_vectors(found.azimuth_rad, found.elevation_rad))

@@ -6,6 +6,7 @@ from typing import Final
 
 from ertis_numba.analysis.health import Finding, Health
 from ertis_numba.analysis.health.kinds import DISABLE, kind_of
+from ertis_numba.base.units import runs
 from ertis_numba.sensor_check.result import CheckFault
 
 __all__ = ["MICROPHONES", "SAMPLES", "channels_in_words", "microphone_faults", "record_faults"]
@@ -42,14 +43,11 @@ _SATURATED_REMEDY: Final = "emit less, or move the array away from near objects,
 
 def channels_in_words(channels: Sequence[int]) -> str:
     """Return a text with rising channels, such as ``channels 0 to 4, 7 and 12``."""
-    runs: list[list[int]] = []
-    for channel in channels:
-        if runs and channel == runs[-1][-1] + 1:
-            runs[-1].append(channel)
-        else:
-            runs.append([channel])
-    long = [[f"{run[0]} to {run[-1]}"] if len(run) > 2 else list(map(str, run)) for run in runs]
-    *first, last = (part for parts in long for part in parts)
+    parts = [
+        [f"{begin} to {end}"] if end > begin + 1 else list(map(str, range(begin, end + 1)))
+        for begin, end in runs(channels)
+    ]
+    *first, last = (each for part in parts for each in part)
     text = f"{', '.join(first)} and {last}" if first else last
     return f"channel{'s' * (len(channels) > 1)} {text}"
 

@@ -124,8 +124,8 @@ def test_errors_of_reflectors_at_any_height_fit_their_deviations(limit_deg, slan
     assert (np.sqrt(np.mean(ratio**2, axis=0)) < 1.3).all()
     assert (np.mean(np.abs(ratio) < 2, axis=0) > 0.93).all()
     assert np.abs(ratio).max() < 6
-    if limit_deg == 10.0:
-        assert (np.sqrt(np.mean(ratio**2, axis=0)) > 0.7).all()
+    # Level reflectors have smaller errors than their deviations, which allow for other elevations.
+    assert (np.sqrt(np.mean(ratio**2, axis=0)) > {0.0: 0.25, 3.0: 0.5, 10.0: 0.7}[limit_deg]).all()
 
 
 def test_places_and_directions_of_level_reflectors_stay_accurate():

@@ -86,6 +86,25 @@ def test_motions_below_the_errors_of_the_poses_are_not_compared():
     assert check.note().endswith("the motion is smaller than the errors of echoes and poses")
 
 
+def test_a_trajectory_for_each_pulse_is_not_compared_and_said():
+    check = PoseCheck(MOUNTINGS)
+    for pulse in range(N_PULSES):
+        pose = PATH[pulse].real, PATH[pulse].imag, YAW_RAD[pulse]
+        check.add([seen_from(pose, places_m(), pulse)], trajectory(PATH, YAW_RAD))
+    assert check.warning() is None
+    assert "nearly every pulse has a trajectory of its own; pass one" in check.note()
+
+
+def test_a_contradiction_counts_in_stated_deviations_along_one_axis():
+    """The same error passes or not by whether the stated deviation of each axis covers it."""
+    place = PATH + np.where(np.arange(N_PULSES) % 2, 0.12, 0.0)
+    kept = []
+    for sd_m in (0.12, 0.01):
+        covariance = np.tile(np.diag([sd_m**2, sd_m**2, 1e-6, 1e-6, 1e-6, 1e-4]), (N_PULSES, 1, 1))
+        kept.append(warning(trajectory(place, YAW_RAD).replace(covariance=covariance)) is None)
+    assert kept == [True, False]
+
+
 def test_poses_that_stand_still_cost_nothing(monkeypatch):
     added = []
     monkeypatch.setattr(Odometry, "add", lambda _, items: added.append(items))

@@ -64,7 +64,7 @@ def test_image_equals_the_exact_one(kind, device):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_matched_signals_equal_those_of_a_convolution(kind):
-    """Filter in the time domain in float64, advance by the mean group delay, and compensate the gain."""
+    """The test filters in the time domain in float64, removes the mean group delay, and compensates the gain."""
     settings = filtered(kind).replace(**{"processing.decimation": 10, "processing.range_decimation": 100})
     with Pipeline(settings, "numpy", predict=False) as pipeline:
         signals = pipeline.signals(noise(settings))

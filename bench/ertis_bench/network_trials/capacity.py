@@ -50,7 +50,7 @@ _PARTS: dict[str, tuple[str, int, int, Trial]] = {
     "3000": (f"sensors × {_RATE_HZ:g} Hz, images of 3000 directions", 2, 256, partial(_imaged, directions="3000")),
     "fused": ("Hz of a platform of four sensors, fused", 10, 40, _fused),
 }
-"""What is searched, by name: its description, the first number, the limit, and the trial of a number."""
+"""Searches by name: a description, the first number to try, the largest one, and the function that tries a number."""
 
 
 def largest(first: int, limit: int, succeeds: Callable[[int], bool]) -> int:
