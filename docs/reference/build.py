@@ -76,7 +76,10 @@ def _row(*cells: str) -> str:
 
 
 if __name__ == "__main__":
+    checking = sys.argv[1:] == ["--check"]
     for path in (FOLDER / name for name in ("settings.md", "commands.md", "python.md")):
-        before = path.read_text("utf-8")
-        path.write_text(after := written(before), "utf-8")
-        sys.stdout.write(f"{path}: {'unchanged' if after == before else 'updated'}\n")
+        if (after := written(before := path.read_text("utf-8"))) == before:
+            continue
+        if not checking:
+            path.write_text(after, "utf-8")
+        sys.stdout.write(f"{path}: {'run make reference' if checking else 'updated'}\n")

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli.devices import devices
+from ertis_cli.main import cli
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
@@ -161,7 +161,7 @@ def four_devices(folder, monkeypatch):
 
 
 def listed(*arguments, code=0):
-    done = CliRunner().invoke(devices, arguments)
+    done = CliRunner().invoke(cli, ["sensors", "list", *arguments])
     assert done.exit_code == code, (done.stderr, done.exception)
     return done
 
@@ -216,8 +216,8 @@ def test_devices_command_prints_json(four_devices):
 def test_devices_command_reports_a_port_without_a_sensor():
     done = listed("-p", "mute", "-p", "new", code=1)
     assert [re.split("  +", line)[2] for line in done.stdout.splitlines()[1:]] == ["no answer", "ready"]
-    assert "does not answer 'firmware version?'" in str(done.exception)
-    assert "serial port 'moot' does not exist" in str(listed("-p", "moot", code=1).exception)
+    assert "does not answer 'firmware version?'" in done.stderr
+    assert "serial port 'moot' does not exist" in listed("-p", "moot", code=1).stderr
 
 
 def test_devices_command_prints_nothing_without_devices(monkeypatch):
