@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, BinaryIO, ClassVar, Final, Literal
 
 import h5py
 import numpy as np
@@ -300,12 +300,13 @@ def _number(path: Path, name: str, value: Any) -> float:
     return found
 
 
-def open_energyscapes(path: str | Path, *, sensor: str | None = None) -> EnergyscapeReader:
+def open_energyscapes(path: str | Path | BinaryIO, *, sensor: str | None = None) -> EnergyscapeReader:
     """Open an energyscape file for reading.
 
     Parameters
     ----------
-    path : str or Path
+    path : str, Path or binary file
+        As for `open_recording`.
     sensor : str, optional
         Name of the sensor, if the file contains several.
 
