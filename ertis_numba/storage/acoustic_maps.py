@@ -88,8 +88,9 @@ class BearingReader:
 
 class _AcousticMapFile(ResultFile):
     _kind: ClassVar[str] = "acoustic_map"
-    _data: ClassVar[str] = "power"
-    _table: ClassVar[tuple[Variable, ...]] = (*ACOUSTIC_MAP, *BEARINGS, *POSES)
+    _data: str = "power"
+    _values: ClassVar[str] = "power"
+    _table: tuple[Variable, ...] = (*ACOUSTIC_MAP, *BEARINGS, *POSES)
     _type: ClassVar[type[Any]] = AcousticMap
     _name: ClassVar[str] = "an acoustic map"
     _axes: ClassVar[Mapping[str, str]] = {

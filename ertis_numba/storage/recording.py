@@ -187,8 +187,8 @@ class RecordingWriter(FileWriter[Measurement]):
     """
 
     _kind: ClassVar[str] = "recording"
-    _data: ClassVar[str] = "pdm"
-    _table: ClassVar[tuple[Variable, ...]] = (*RECORDING, *POSES)
+    _data: str = "pdm"
+    _table: tuple[Variable, ...] = (*RECORDING, *POSES)
     _numbered: ClassVar[bool] = True
 
     def __init__(
