@@ -3,9 +3,10 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+
+from ertis_numba.base import fourier
 
 __all__ = [
     "ROUNDING",
@@ -73,7 +74,7 @@ def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDAr
     # Half-overlapping segments under a Hann window (P. D. Welch, 1967), as scipy.signal has, whose import takes longer.
     segments = sliding_window_view(signal, size)[:: size // 2]
     window = np.hanning(size + 1)[:-1].astype(np.float32)
-    lines = scipy.fft.rfft(segments * window)[:, :n_lines]
+    lines = fourier.rfft(segments * window)[:, :n_lines]
     return np.asarray((lines.real**2 + lines.imag**2) * np.float32(2 / size / (window @ window)))
 
 

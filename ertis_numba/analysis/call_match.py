@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.call_start import WIDER, start_error_s, start_match
@@ -26,6 +25,7 @@ from ertis_numba.analysis.sweep_search import (
     sweep_along,
 )
 from ertis_numba.analysis.sweeps import Curve, Sweep, curve_of
+from ertis_numba.base import fourier
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call
@@ -159,7 +159,7 @@ def _filter_rad(call: Call, sound: SoundSpectra, part: slice) -> NDArray[np.floa
     curve = curve_of(call)
     if curve is not None:
         return curve.phase_rad(sound.frequency_hz[part])
-    spectrum = scipy.fft.rfft(call_samples(call, rate_hz=sound.rate_hz), sound.n_fft)
+    spectrum = fourier.rfft(call_samples(call, rate_hz=sound.rate_hz), sound.n_fft)
     first = round(float(sound.frequency_hz[0]) * sound.n_fft / sound.rate_hz)
     return np.asarray(-np.angle(spectrum[first:][part]))
 
@@ -170,7 +170,7 @@ def _is_heard(sound: SoundSpectra, call: Call) -> bool:
     if part.stop - part.start < _MIN_BINS:
         return False
     power = power_after(sound, _filter_rad(call, sound, part), part)
-    half = max(2, round(_SMEAR * call.duration_s * sound.rate_hz))
+    half = max(2, round(_SMEAR * call.duration_s * sound.time_rate_hz))
     return _snr(power) >= _MIN_SNR and _crest(power, half) >= _MIN_CREST
 
 

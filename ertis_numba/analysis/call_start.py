@@ -8,11 +8,10 @@ import functools
 from typing import Final, Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.sound_spectra import SoundSpectra, sound_spectra
-from ertis_numba.analysis.sweep_search import GatedArrival, arrival_of
+from ertis_numba.analysis.sweep_search import GatedArrival, arrival_of, run_around
 from ertis_numba.analysis.sweeps import Curve
 from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Call
@@ -122,10 +121,8 @@ def _begin_s(
     since_s: NDArray[np.float64], power: NDArray[np.float64], level: NDArray[np.float64], is_first: NDArray[np.bool_]
 ) -> tuple[float, float]:
     """Return the times at which a power exceeds a level, across short gaps by interference, and half its peak."""
-    gap = np.ones(round(_GAP_S / _STEP_S), bool)
-    is_loud = power > level
-    groups, _ = scipy.ndimage.label(scipy.ndimage.binary_closing(np.pad(is_loud, len(gap)), gap)[len(gap) : -len(gap)])
-    is_heard = is_loud & (groups == groups[np.argmax(np.where(is_first, power, 0))])
+    highest = int(np.argmax(np.where(is_first, power, 0)))
+    is_heard = run_around(power > level, highest, round(_GAP_S / _STEP_S) - 1)
     return float(since_s[np.argmax(is_heard)]), float(since_s[np.argmax(is_heard & (power > _HALF))])
 
 

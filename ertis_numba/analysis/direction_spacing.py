@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple, Self
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.array_response import ArrayAxes, CallResponse, Response
 from ertis_numba.analysis.between_directions import Between, farthest_places
 from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.geometry import direction_grid, microphones, named_grid, observable_angles, spacing_rad, unit_vectors
+from ertis_numba.geometry.neighbours import Nearest
 from ertis_numba.settings import Processing, Settings
 
 __all__ = ["LARGEST_GRID", "MAX_LOSS_DB", "GridCheck", "Lobe", "Peak", "image_peak", "rounded_down", "spacing_warning"]
@@ -112,7 +112,7 @@ class GridCheck:
     def farthest_of(self, axes: ArrayAxes) -> tuple[Floats, NDArray[np.intp], float]:
         """Return the places farthest from all directions, the directions nearest to them, and their distance in m."""
         if self._farthest is None:
-            tree, count = scipy.spatial.KDTree(axes.scaled_m(self._directions)), min(_NEAREST, len(self._directions))
+            tree, count = Nearest(axes.scaled_m(self._directions)), min(_NEAREST, len(self._directions))
             sources = farthest_places(self._between, lambda places: tree.query(axes.scaled_m(places))[0])
             apart_m, near = tree.query(axes.scaled_m(sources), k=count)
             farthest_m = float(apart_m.reshape(len(sources), count)[:, 0].max())

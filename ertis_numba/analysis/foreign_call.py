@@ -4,12 +4,13 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.sound_spectra import SoundSpectra
 from ertis_numba.analysis.sweep_search import FoundSweep, find_sweep, power_after
 from ertis_numba.analysis.sweeps import Curve, Sweep
+from ertis_numba.base import fourier
 from ertis_numba.settings import Call
 
 __all__ = ["foreign_sweep"]
@@ -47,27 +48,25 @@ def _is_own(sound: SoundSpectra, rest: SoundSpectra, found: FoundSweep, curve: C
     filter_rad, own_rad = (each.phase_rad(rest.frequency_hz[part]) for each in (found.curve, curve))
     peaks = power_after(rest, filter_rad, part).argmax(axis=1)
     turned = sound.bins[:, part] * np.exp(1j * filter_rad).astype(np.complex64)
-    around = np.arange(round(-_AROUND_S * sound.rate_hz), round(_AROUND_S * sound.rate_hz) + 1)
-    after = np.take_along_axis(
-        scipy.fft.ifft(turned, sound.n_fft, axis=1), (peaks[:, None] + around) % sound.n_fft, axis=1
-    )
+    around = np.arange(round(-_AROUND_S * sound.time_rate_hz), round(_AROUND_S * sound.time_rate_hz) + 1)
+    after = np.take_along_axis(fourier.ifft(turned, sound.n_times), (peaks[:, None] + around) % sound.n_times, axis=1)
     power = np.abs(after) ** 2
     at_peak, usual = power[:, len(around) // 2], np.median(power, axis=1)
-    gated = np.zeros((len(after), sound.n_fft), np.complex64)
-    gated[:, : len(around)] = after * np.clip(1.5 - np.abs(around) / (_GATE_S * sound.rate_hz), 0, 1)
-    own = scipy.fft.fft(gated, axis=1)[:, : len(own_rad)] * np.exp(1j * (own_rad - filter_rad)).astype(np.complex64)
-    of_own = np.abs(scipy.fft.ifft(own, sound.n_fft, axis=1)).max(axis=1) ** 2
+    gated = np.zeros((len(after), sound.n_times), np.complex64)
+    gated[:, : len(around)] = after * np.clip(1.5 - np.abs(around) / (_GATE_S * sound.time_rate_hz), 0, 1)
+    own = fourier.fft(gated)[:, : len(own_rad)] * np.exp(1j * (own_rad - filter_rad)).astype(np.complex64)
+    of_own = np.abs(fourier.ifft(own, sound.n_times)).max(axis=1) ** 2
     return bool(np.median(at_peak / np.maximum(np.maximum(_BETTER * of_own, _MIN_RATIO * usual), 1e-30)) < 1)
 
 
 def _without_peaks(sound: SoundSpectra, curve: Curve) -> SoundSpectra:
     """Return the sound without the peaks after the filter of a curve."""
     turn = np.exp(1j * curve.phase_rad(sound.frequency_hz)).astype(np.complex64)
-    after = scipy.fft.ifft(sound.bins * turn, sound.n_fft, axis=1)
+    after = fourier.ifft(sound.bins * turn, sound.n_times)
     power = after.real**2 + after.imag**2
-    usual = _medians(power, max(1, round(_FRAME_S * sound.rate_hz)))
+    usual = _medians(power, max(1, round(_FRAME_S * sound.time_rate_hz)))
     after *= np.sqrt(np.minimum(1.0, _STEADY * usual / np.maximum(power, 1e-30))).astype(np.float32)
-    bins = scipy.fft.fft(after, axis=1)[:, : len(turn)] * turn.conj()
+    bins = fourier.fft(after)[:, : len(turn)] * turn.conj()
     return replace(sound, bins=bins.astype(np.complex64))
 
 
@@ -75,5 +74,5 @@ def _medians(power: NDArray[np.float32], length: int) -> NDArray[np.float32]:
     """Return the median of each frame and of its neighbours, whichever is less, at all samples."""
     count = power.shape[1] // length
     frames = np.median(power[:, : count * length].reshape(len(power), count, length), axis=2)
-    frames = scipy.ndimage.minimum_filter1d(frames, 3, axis=1)
+    frames = sliding_window_view(np.pad(frames, ((0, 0), (1, 1)), mode="edge"), 3, axis=1).min(axis=2)
     return np.asarray(np.repeat(frames, length, axis=1)[:, np.minimum(np.arange(power.shape[1]), count * length - 1)])

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ertis_numba.analysis import _bits
-from ertis_numba.analysis.health import ARRAY_FAULTS, Finding
+from ertis_numba.analysis.health import ARRAY_FAULTS, Finding, Health
 from ertis_numba.analysis.health.limits import MAX_SAMPLES, MIN_SAMPLES
+from ertis_numba.analysis.health.not_observable import OF_ARRIVAL
 from ertis_numba.analysis.health.pcm_samples import scaled
 from ertis_numba.analysis.health.wavefront import by_array
 from ertis_numba.frames import Measurement
 from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,6 +39,15 @@ class LayoutMatch:
     def of(cls, findings: Iterable[Finding]) -> "LayoutMatch":
         """Return the match that findings of a health report describe."""
         return cls(next((each for each in findings if each.fault in ARRAY_FAULTS), None))
+
+    @classmethod
+    def of_report(cls, report: Health, settings: Settings) -> "LayoutMatch | None":
+        """Return the match in a report that compared the same channels as `layout_match` does; None for another one."""
+        found = cls.of(report.findings)
+        has_arrival = not any(set(OF_ARRIVAL) <= {*each.faults} for each in report.not_observable)
+        is_whole = settings.recording.is_pdm and _MIN_MICS <= len(report.channels) <= _MAX_MICS and not report.unknown
+        is_same = is_whole and has_arrival and not any(channel.faults for channel in report.channels)
+        return found if found.warning or is_same else None
 
     @property
     def warning(self) -> str:

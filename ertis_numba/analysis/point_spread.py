@@ -4,10 +4,10 @@ import functools
 import math
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.base import fourier
 from ertis_numba.chain.plan_response import Deviation
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
@@ -110,7 +110,7 @@ class PointSpread:
     def _ends_m(self, settings: Settings) -> list[float]:
         """Return the range offsets beyond which the pulse is weaker than each of `_SKIRTS`."""
         rate_hz = settings.signal_rate_hz
-        n_fft = scipy.fft.next_fast_len(2 * math.ceil(settings.call.end_s * rate_hz) + 1)
+        n_fft = fourier.next_fast_len(2 * math.ceil(settings.call.end_s * rate_hz) + 1)
         power = matched_filter_spectrum(settings, n_fft=n_fft).echo_power
         pulse = np.abs(np.fft.ifft(power, n_fft))[: n_fft // 2]
         ends = (np.flatnonzero(~(pulse < level * pulse[0]))[-1] for level in _SKIRTS)

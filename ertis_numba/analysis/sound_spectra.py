@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.base import fourier
 from ertis_numba.frames import Measurement
 from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import microphones
@@ -19,6 +19,7 @@ _TAPERED_S: Final = 0.3e-3  # Length of the taper at each end of the record.
 _MAX_SAMPLES: Final = 2**17  # Limit on the memory of long records.
 _MAX_HZ: Final = 200e3  # Microphones of air sonars end below it, and the noise of PDM rises.
 _EDGE: Final = 0.45  # Highest frequency relative to the sample rate.
+_OVERSAMPLING: Final = 4  # Between samples, peaks of the whole band lose up to 5 % of their power.
 _FRAME_S: Final = 1e-3
 _MIN_FRAME: Final = 64
 _FLOOR: Final = 1e-2  # Lowest noise that counts, relative to the loudest frequency: sound must not be all side lobes.
@@ -26,7 +27,10 @@ _FLOOR: Final = 1e-2  # Lowest noise that counts, relative to the loudest freque
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundSpectra:
-    """Spectra (mic, bin) of some microphones, divided by the magnitude ``noise`` (bin,) of the stationary noise."""
+    """Spectra (mic, bin) of some microphones, divided by the magnitude ``noise`` (bin,) of the stationary noise.
+
+    Transforms back to time have ``n_times`` samples at ``time_rate_hz``, which the band needs, not all of the record.
+    """
 
     bins: NDArray[np.complex64]
     noise: NDArray[np.float64]
@@ -34,6 +38,16 @@ class SoundSpectra:
     n_samples: int
     n_fft: int
     rate_hz: float
+
+    @property
+    def n_times(self) -> int:
+        """Number of samples of signals in the band."""
+        return min(self.n_fft, fourier.next_fast_len(_OVERSAMPLING * len(self.frequency_hz)))
+
+    @property
+    def time_rate_hz(self) -> float:
+        """Sample rate of signals in the band."""
+        return self.rate_hz * self.n_times / self.n_fft
 
     @property
     def whole_s(self) -> tuple[float, float]:
@@ -70,19 +84,19 @@ def some_signals(measurement: Measurement, max_mics: int) -> tuple[NDArray[np.fl
 def sound_spectra(signals: NDArray[np.float32], rate_hz: float, *, low_hz: float, padding_s: float) -> SoundSpectra:
     """Return spectra from ``low_hz`` on, in which stationary noise and tones are flat, with zeros of ``padding_s``."""
     n_samples = signals.shape[1]
-    n_fft = scipy.fft.next_fast_len(n_samples + round(padding_s * rate_hz), real=True)
+    n_fft = fourier.next_fast_len(n_samples + round(padding_s * rate_hz), real=True)
     high_hz = min(_EDGE * rate_hz, _MAX_HZ)
     bins = np.arange(max(1, round(low_hz * n_fft / rate_hz)), round(high_hz * n_fft / rate_hz) + 1)
     frequency_hz = bins * rate_hz / n_fft
     length = min(n_samples, max(_MIN_FRAME, round(_FRAME_S * rate_hz)))
     count = n_samples // length
     frames = signals[:, : count * length].reshape(-1, count, length) * np.hanning(length).astype(np.float32)
-    power = np.abs(scipy.fft.rfft(frames, axis=2)) ** 2
+    power = np.abs(fourier.rfft(frames)) ** 2
     of_noise = np.median(power, axis=1).mean(axis=0) / math.log(2)
     at_hz = np.arange(len(of_noise)) * rate_hz / length
     loudest = float(np.interp(frequency_hz, at_hz, power.mean(axis=(0, 1))).max(initial=0.0))
     noise = np.sqrt(np.maximum(np.interp(frequency_hz, at_hz, of_noise), _FLOOR * loudest + 1e-300))
     spectra = np.empty((len(signals), len(bins)), np.complex64)
     for each, signal in zip(spectra, signals, strict=True):  # One by one, because long records need much memory.
-        each[:] = scipy.fft.rfft(signal, n_fft)[bins] / noise
+        each[:] = fourier.rfft(signal, n_fft)[bins] / noise
     return SoundSpectra(spectra, noise, frequency_hz, n_samples, n_fft, rate_hz)

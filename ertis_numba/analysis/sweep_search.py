@@ -4,16 +4,18 @@ Sub-bands find the slope of the group delay at each frequency, because few slope
 through these slopes compresses the sound over its whole band, and is then refined around the strongest arrival.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.sound_spectra import SoundSpectra
 from ertis_numba.analysis.sweeps import MODULATIONS, Curve, Modulation, Sweep
+from ertis_numba.base import fourier
 
 __all__ = [
     "FoundSweep",
@@ -22,6 +24,7 @@ __all__ = [
     "find_sweep",
     "power_after",
     "refined",
+    "run_around",
     "sub_band_hz",
     "sweep_along",
 ]
@@ -34,6 +37,7 @@ _N_CURVES: Final = 120  # of either direction
 _MIN_RATIO: Final = 17.0  # Peak to mean power in a sub-band; noise reaches about 13.
 _MIN_SCORE: Final = 10.0  # Sum of the excess over sub-bands.
 _MIN_POWER: Final = 10**-2.5  # Power of a sub-band relative to the strongest; others contain side lobes of its sound.
+_MAX_GAP: Final = 2  # Sub-bands
 _OCCUPIED: Final = 0.1  # Excess of an occupied sub-band relative to the highest.
 _ALTERNATIVE: Final = 0.3  # Score of another modulation relative to the best, with which it is also refined.
 _GATE_S: Final = 2e-3  # Half the length of the sound around the strongest arrival.
@@ -47,17 +51,24 @@ _WIDER: Final = 1.2
 _EDGE: Final = 0.1  # Power at the edges of a band relative to its middle.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class GatedArrival:
     """Sound around the strongest arrival of each microphone after a curve's filter, with its power ``peak`` (mic,)."""
 
-    # `elsewhere` (bin,) is the median power spectrum of other parts; `noise` (bin,) has divided the spectra.
+    # `around` returns the spectra at a shift in samples, and `noise` (bin,) has divided them.
 
     spectra: NDArray[np.complex128]
     frequency_hz: NDArray[np.float64]
     peak: NDArray[np.float64]
-    elsewhere: NDArray[np.float64]
+    shifts: range
+    around: Callable[[int], NDArray[np.complex128]]
     noise: NDArray[np.float64]
+
+    @functools.cached_property
+    def elsewhere(self) -> NDArray[np.float64]:
+        """Median power spectrum of other parts of the record: (bin,) float64. Most arrivals are compared without it."""
+        others = [np.mean(np.abs(self.around(shift)) ** 2, axis=0) for shift in self.shifts]
+        return np.asarray(np.median(others or np.zeros((1, len(self.frequency_hz))), axis=0))
 
     @property
     def power(self) -> NDArray[np.float64]:
@@ -72,7 +83,8 @@ class GatedArrival:
     def _smoothed(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
         step_hz = self.frequency_hz[1] - self.frequency_hz[0]
         size = max(1, round(_SMOOTHED_HZ / step_hz))
-        return np.asarray(scipy.ndimage.uniform_filter1d(power * self.noise**2, size))
+        around = np.pad(power * self.noise**2, (size // 2, (size - 1) // 2), mode="symmetric")
+        return np.asarray(sliding_window_view(around, size).mean(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,8 +145,8 @@ def _sub_bands(
 
 def _peak_ratios(filters: NDArray[np.complex64], bins: NDArray[np.complex64]) -> NDArray[np.float32]:
     """Return the peak to mean power after each filter, which have equal magnitudes: (filter,) float32."""
-    n_fft = scipy.fft.next_fast_len(2 * len(bins), real=True)  # without slow factors of 7 and 11
-    after = scipy.fft.ifft(filters * bins, n_fft, axis=1, norm="forward", overwrite_x=True)
+    n_fft = fourier.next_fast_len(2 * len(bins), real=True)  # without slow factors of 7 and 11
+    after = fourier.ifft(filters * bins, n_fft, normalised=False, overwrite=True)
     parts = after.view(np.float32)
     np.multiply(parts, parts, out=parts)
     peaks = (parts[:, ::2] + parts[:, 1::2]).max(axis=1)
@@ -163,10 +175,18 @@ def _best_curve(
 
 
 def _run_around_highest(along: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the occupied sub-bands around the strongest one, with gaps of at most one sub-band: (sub-band,) bool."""
+    """Return the occupied sub-bands around the strongest one, across short gaps: (sub-band,) bool."""
     is_occupied = along > _OCCUPIED * along.max()
-    groups, _ = scipy.ndimage.label(scipy.ndimage.binary_closing(np.pad(is_occupied, 1))[1:-1])
-    return np.asarray(is_occupied & (groups == groups[int(along.argmax())]))
+    return run_around(is_occupied, int(along.argmax()), _MAX_GAP)
+
+
+def run_around(is_loud: NDArray[np.bool_], place: int, max_gap: int) -> NDArray[np.bool_]:
+    """Return the loud places of the run around one of them, across gaps of at most ``max_gap`` places."""
+    loud = np.flatnonzero(is_loud)
+    runs = np.cumsum(np.diff(loud, prepend=loud[0]) > max_gap + 1)
+    found = np.zeros(is_loud.shape, np.bool_)
+    found[loud[runs == runs[np.searchsorted(loud, place)]]] = True
+    return found
 
 
 def _focused(found: SoundSpectra, curve: Curve, low_hz: float, high_hz: float) -> tuple[Curve, GatedArrival]:
@@ -182,7 +202,7 @@ def _focused(found: SoundSpectra, curve: Curve, low_hz: float, high_hz: float) -
 
 def power_after(found: SoundSpectra, filter_rad: NDArray[np.float64], part: slice) -> NDArray[np.float32]:
     """Return the power over time after a filter with given phases in a band: (mic, sample) float32."""
-    after = scipy.fft.ifft(found.bins[:, part] * np.exp(1j * filter_rad).astype(np.complex64), found.n_fft, axis=1)
+    after = fourier.ifft(found.bins[:, part] * np.exp(1j * filter_rad).astype(np.complex64), found.n_times)
     return np.asarray(after.real**2 + after.imag**2)
 
 
@@ -199,36 +219,35 @@ def arrival_of(
     part = found.band(low_hz, high_hz)
     frequency_hz = found.frequency_hz[part]
     turned = found.bins[:, part] * np.exp(1j * curve.phase_rad(frequency_hz)).astype(np.complex64)
-    after = scipy.fft.ifft(turned, found.n_fft, axis=1)
+    after = fourier.ifft(turned, found.n_times)
     power = after.real**2 + after.imag**2
-    half = min(round(gate_s * found.rate_hz), found.n_fft // 4)
+    half = min(round(gate_s * found.time_rate_hz), found.n_times // 4)
     window = np.hanning(2 * half) ** 0.25
-    n_fft = scipy.fft.next_fast_len(2 * len(window))
-    step_hz = found.rate_hz / n_fft
+    n_fft = fourier.next_fast_len(2 * len(window))
+    step_hz = found.time_rate_hz / n_fft
     n_bins = int((frequency_hz[-1] - frequency_hz[0]) / step_hz) + 1
     at_hz = frequency_hz[0] + np.arange(n_bins) * step_hz
     noise = np.interp(at_hz, found.frequency_hz, found.noise)  # For the spectrum as it was recorded.
 
-    def around(middle: NDArray[np.intp]) -> NDArray[np.complex128]:
-        places = (middle[:, None] + np.arange(-half, half)) % found.n_fft
+    def around(shift: int) -> NDArray[np.complex128]:
+        places = (peaks[:, None] + shift + np.arange(-half, half)) % found.n_times
         parts = np.take_along_axis(after, places, axis=1) * window
-        return np.asarray(scipy.fft.fft(parts, n_fft, axis=1)[:, :n_bins])
+        return np.asarray(fourier.fft(parts, n_fft)[:, :n_bins])
 
-    seconds = np.arange(found.n_fft)[:, None] / found.rate_hz + curve.delay_s(np.array(whole_hz))
+    seconds = np.arange(found.n_times)[:, None] / found.time_rate_hz + curve.delay_s(np.array(whole_hz))
     seconds %= found.n_fft / found.rate_hz
     is_whole = ((seconds >= found.whole_s[0]) & (seconds <= found.whole_s[1])).all(axis=1)
     power = np.where(is_whole, power, 0)
     peaks = power.argmax(axis=1)
-    shifts = np.arange(2 * half, found.n_fft - 2 * half + 1, 2 * half)
-    others = [np.mean(np.abs(around(peaks + shift)) ** 2, axis=0) for shift in shifts] or [np.zeros(n_bins)]
-    return GatedArrival(around(peaks), at_hz, power.max(axis=1), np.median(others, axis=0), noise)
+    shifts = range(2 * half, found.n_times - 2 * half + 1, 2 * half)
+    return GatedArrival(around(0), at_hz, power.max(axis=1), shifts, around, noise)
 
 
 def refined(arrival: GatedArrival, curve: Curve) -> tuple[Curve, float]:
     """Return the curve of any modulation with the highest peak at an arrival, and the ratio of both peak powers."""
     at_hz = arrival.frequency_hz
     before_rad = curve.phase_rad(at_hz)
-    n_fft = scipy.fft.next_fast_len(2 * len(at_hz))
+    n_fft = fourier.next_fast_len(2 * len(at_hz))
     given = _peaks(arrival, np.zeros((1, len(at_hz))), n_fft)[0]
     best = (1.0, curve)
     is_heard = given > 0
@@ -255,7 +274,7 @@ def refined(arrival: GatedArrival, curve: Curve) -> tuple[Curve, float]:
 def _peaks(arrival: GatedArrival, phases_rad: NDArray[np.float64], n_fft: int) -> NDArray[np.float64]:
     """Return the peak power after filters with given phases: (filter, mic) float64."""
     filters = np.exp(1j * phases_rad).astype(np.complex64)
-    after = scipy.fft.ifft(filters[:, None] * arrival.spectra.astype(np.complex64), n_fft, axis=2)
+    after = fourier.ifft(filters[:, None] * arrival.spectra.astype(np.complex64), n_fft)
     return np.asarray((after.real**2 + after.imag**2).max(axis=2), dtype=np.float64)
 
 

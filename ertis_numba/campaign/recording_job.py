@@ -214,8 +214,7 @@ def _check(recording: EchoMeasurements, settings: Settings, *, several: bool) ->
     some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
     speed_m_s, delay_s = sound_speed_m_s(settings.air), settings.call.delay_s
     shift = describe_start(map(emissions_of, some), speed_m_s, delay_s=delay_s)
-    of_report = LayoutMatch.of(report.findings)
-    layout = of_report if of_report.warning else first_layout_match(heard())
+    layout = LayoutMatch.of_report(report, settings) or first_layout_match(heard())
     return faults, "; ".join(shift or ()), call, layout
 
 

@@ -313,11 +313,11 @@ class BeamGrid:
         nearest_m: float,
     ) -> NDArray[np.float64]:
         """Return the errors, (wave,), of the plane-wave weights for waves from a point at ``nearest_m``."""
-        errors = np.zeros(len(self.frequency_hz))
+        errors, steps = np.zeros(len(self.frequency_hz)), _steps_of(self.frequency_hz)
         for k, place in enumerate(inside):
             points = np.concatenate([moved[k] + patch, (moved[k] + place)[None]])
             delays_s = self._aperture.delays_s(points, sound_speed_m_s=self._sound_speed_m_s, range_m=nearest_m)
-            waves = _waves_of(delays_s[:, mics], self.frequency_hz)
+            waves = _waves_of(delays_s[:, mics], *steps)
             made = np.einsum("wpm,p->mw", waves[:, :-1], weights[:, k]) * gain
             errors += np.mean(np.abs(made - waves[:, -1].T) ** 2, axis=0)
         return errors / len(inside)
@@ -349,9 +349,18 @@ class BeamGrid:
         return waves.reshape(-1, len(points))
 
 
-def _waves_of(delay_s: NDArray[np.float64], frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return waves (wave, ...) of delays as products, because frequencies have few different steps."""
-    steps_hz, which = np.unique(np.diff(frequency_hz, prepend=0.0), return_inverse=True)
+def _steps_of(frequency_hz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return the few different steps between frequencies, and the index of each: (wave,)."""
+    found: tuple[NDArray[np.float64], NDArray[np.intp]] = np.unique(
+        np.diff(frequency_hz, prepend=0.0), return_inverse=True
+    )
+    return found
+
+
+def _waves_of(
+    delay_s: NDArray[np.float64], steps_hz: NDArray[np.float64], which: NDArray[np.intp]
+) -> NDArray[np.complex128]:
+    """Return waves (wave, ...) of delays as products of those of the steps between frequencies."""
     factors = np.exp(2j * math.pi * steps_hz.reshape(-1, *[1] * delay_s.ndim) * delay_s)
     return np.asarray(np.multiply.accumulate(factors[which], axis=0))
 

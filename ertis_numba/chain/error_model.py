@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.base import fourier
 from ertis_numba.chain.beam_grid import Aperture, BeamGrid
 from ertis_numba.chain.focal_zones import NEAREST_M
 from ertis_numba.chain.interpolation_fit import WAVES, DelayFit
@@ -217,16 +217,16 @@ class ErrorModel:
         """
         settings, model = self._settings, self.signal_model
         rate_hz, call_s = settings.signal_rate_hz, settings.call.end_s
-        n_fft = scipy.fft.next_fast_len(math.ceil((2 * call_s + _GUARDS * guard_s) * rate_hz))
+        n_fft = fourier.next_fast_len(math.ceil((2 * call_s + _GUARDS * guard_s) * rate_hz))
         matched = matched_filter_spectrum(settings, n_fft=n_fft)
         spectrum = np.zeros(n_fft, dtype=np.complex128)
         spectrum[matched.first_bin : matched.first_bin + len(matched.values)] = matched.values
-        response = scipy.fft.ifft(spectrum)
-        time_s = scipy.fft.fftfreq(n_fft, 1 / n_fft) / rate_hz
+        response = fourier.ifft(spectrum)
+        time_s = np.fft.fftfreq(n_fft, 1 / n_fft) / rate_hz
         response[(time_s <= guard_s) & (time_s >= -call_s - guard_s)] = 0
         noise_hz, noise = self._filtered_noise(taps)
-        heard = np.interp(np.abs(scipy.fft.fftfreq(n_fft, 1 / rate_hz)), noise_hz, noise)
-        missed = float(np.abs(scipy.fft.fft(response)) ** 2 @ heard) / float(np.sum(np.abs(matched.values) ** 2))
+        heard = np.interp(np.abs(np.fft.fftfreq(n_fft, 1 / rate_hz)), noise_hz, noise)
+        missed = float(np.abs(fourier.fft(response)) ** 2 @ heard) / float(np.sum(np.abs(matched.values) ** 2))
         inside = imaged_s / guard_s
         mean = (1 - (1 + inside) ** -5) / (5 * inside) if inside else 1.0
         return self._everywhere(2 * mean * missed / model.level)

@@ -273,6 +273,7 @@ class PlanModel:
         table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
         return table + signals
 
+    @cached_in_instance
     def zone_error(self, count: int) -> float:
         """Return the error power of a given number of focal zones."""
         curvature_2 = squared_curvature(self.window.range_m, self._zones(count))

@@ -4,9 +4,9 @@ import math
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.base import fourier
 from ertis_numba.chain.beam_grid import estimated_mics
 from ertis_numba.chain.error_model import SignalModel
 from ertis_numba.chain.fast_chain import FastChain
@@ -110,7 +110,7 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
     # Without a taper, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
     edge = np.arange(series.shape[1]) / max(1, series.shape[1] - 1)
     taper = np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, 1 - edge) / _TAPERED)) ** 2
-    found = np.sum(np.abs(scipy.fft.fft(series * taper, axis=1)) ** 2, axis=0)
+    found = np.sum(np.abs(fourier.fft(series * taper)) ** 2, axis=0)
     centres_hz, nominal = matched_noise_spectrum(settings, n_waves=WAVES)
     # Sampling at this rate has shifted the band by a multiple of the rate.
     bins = np.rint(centres_hz / rate_hz * len(found)).astype(int)
@@ -131,7 +131,7 @@ def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: floa
     padded = np.pad(series[mics], ((0, 0), (half, length + half)))
     tiles = np.lib.stride_tricks.sliding_window_view(padded, length, axis=1)[:, :: max(1, half)]
     # Without a window, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
-    spectra = scipy.fft.fft(tiles * np.hanning(length), axis=2)
+    spectra = fourier.fft(tiles * np.hanning(length))
     # Sampling has shifted the band by multiples of the rate. Each bin represents its alias within the band.
     bins_hz = np.arange(length) * rate_hz / length
     frequency_hz = bins_hz + rate_hz * np.rint(((centres_hz[0] + centres_hz[-1]) / 2 - bins_hz) / rate_hz)
@@ -170,6 +170,6 @@ def _noise(words: NDArray[Any], settings: Settings, kernels: KernelSet) -> NDArr
         else:
             scale = np.float32(1 / settings.recording.full_scale)
             kernels.unpack_pcm(part, channels, scale, np.float32(0), 0, signals)
-        spectra = scipy.fft.rfft(signals.reshape(-1, segment) * window, axis=1)
+        spectra = fourier.rfft(signals.reshape(-1, segment) * window)
         power += np.sum(np.abs(spectra) ** 2, axis=0, dtype=np.float64)
     return power / (len(channels) * n_segments * float(np.sum(window**2)))

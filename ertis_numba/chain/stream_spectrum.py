@@ -5,9 +5,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.base import fourier
 from ertis_numba.chain.interpolation_fit import WAVES, DelayFit, Spectrum
 from ertis_numba.settings.beamformers import SignalStream
 
@@ -83,8 +83,8 @@ def _whole(spectrum: Spectrum, stream: SignalStream, stretch: float) -> Spectrum
     power = np.zeros(_LENGTH)
     for _ in range(_RUNS):
         parts = random.standard_normal((2, _LENGTH))
-        noise = scipy.fft.ifft(root * (parts[0] + 1j * parts[1]))
-        power += np.abs(scipy.fft.fft(_values(noise, stream))) ** 2
+        noise = fourier.ifft(root * (parts[0] + 1j * parts[1]))
+        power += np.abs(fourier.fft(_values(noise, stream))) ** 2
     # Even bins in the middle, and geometric ones in the tails.
     inner_hz, outer_hz = stretch * width_hz / 2, float(np.abs(bins_hz).max()) * (1 + 1e-9)
     tail_hz = np.geomspace(inner_hz, max(2 * inner_hz, outer_hz), _TAIL_BINS + 1)[1:]

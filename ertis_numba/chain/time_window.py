@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.base import fourier
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.geometry.waveform import matched_guard_s
@@ -66,7 +66,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     start_s = 2 * first_m / speed_m_s - lead / output_rate_hz
     stop_s = start_s + (n_ranges + 2 * lead) / output_rate_hz
     spanned_s = stop_s - start_s + settings.call.end_s + 2 * guard_s
-    n_outputs = scipy.fft.next_fast_len(math.ceil(spanned_s * output_rate_hz))
+    n_outputs = fourier.next_fast_len(math.ceil(spanned_s * output_rate_hz))
     n_fft = n_outputs * settings.output_decimation
     rate_hz = settings.signal_rate_hz
     decimation = settings.decimation

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.health import health, merge
-from ertis_numba.analysis.layout_match import first_layout_match, layout_match
+from ertis_numba.analysis.layout_match import LayoutMatch, first_layout_match, layout_match
 from ertis_numba.base.errors import LayoutMismatchWarning
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import layout_names, load_layout
@@ -59,8 +59,25 @@ def test_layout_match_finds_the_layout_of_recordings(recording, layout):
     with open_recording(DATA / recording) as reader:
         measurement = reader[0]
     settings = measurement.settings.replace(array=Array(layout=layout))
-    found = layout_match(dataclasses.replace(measurement, settings=settings)).warning
+    measurement = dataclasses.replace(measurement, settings=settings)
+    match = layout_match(measurement)
+    # Processing takes the match of the health report, and compares again only without one.
+    assert LayoutMatch.of_report(health(measurement), settings) in {match, None if layout != "eRTIS_v3D1" else match}
+    found = match.warning
     assert not found if layout == "eRTIS_v3D1" else "layout eRTIS_v3D1 fits far better" in found
+
+
+def test_report_without_arrival_or_of_fewer_channels_is_no_match():
+    with open_recording(DATA / "reflectors_3d.h5") as reader:
+        measurement = reader[0]
+    settings, report = measurement.settings, health(measurement)
+    assert not LayoutMatch.of_report(report, settings).warning
+    silent = np.resize(np.uint32([0x55555555, 0xAAAAAAAA]), measurement.data.shape)
+    other = health(dataclasses.replace(measurement, data=silent))
+    faulty = dataclasses.replace(report.channels[0], faults=("dead",))
+    for doubtful in (other, dataclasses.replace(report, channels=(faulty, *report.channels[1:]))):
+        assert LayoutMatch.of_report(doubtful, settings) is None
+    assert LayoutMatch.of_report(report, SETTINGS) is None
 
 
 @pytest.mark.parametrize("size_m", [0.02, 0.1, 0.5])

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.limits import MAX_DELAY_S
+from ertis_numba.base import fourier
 from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call
 
@@ -64,9 +64,9 @@ def compress(
 ) -> Compressed:
     """Return samples ``first`` to ``last`` after the matched filter, starting one call length before the first."""
     replica = call_samples(call, rate_hz=rate_hz)
-    n_fft = scipy.fft.next_fast_len(last - first + len(replica), real=True)
+    n_fft = fourier.next_fast_len(last - first + len(replica), real=True)
     low, high = (round(hz * n_fft / rate_hz) for hz in (call.low_frequency_hz, call.high_frequency_hz))
-    matched = np.conj(scipy.fft.rfft(replica, n_fft)[low : high + 1])
+    matched = np.conj(fourier.rfft(replica, n_fft)[low : high + 1])
     matched /= np.sum(np.abs(matched) ** 2) / n_fft
     bins = np.stack([_spectrum(signals(channel)[first:last], n_fft)[low : high + 1] for channel in channels]) * matched
     # Negative lags lie at the end of the cyclic result. A roll by the length of the call moves them to the start.
@@ -74,12 +74,12 @@ def compress(
     n_steps = 1 << (_OVERSAMPLING * bins.shape[1] - 1).bit_length()
     step_s = n_fft / rate_hz / n_steps
     before = int(len(replica) / rate_hz / step_s)
-    envelope = np.roll(np.abs(scipy.fft.ifft(bins, n_steps, axis=1)), before, axis=1) * (n_steps / n_fft)
+    envelope = np.roll(np.abs(fourier.ifft(bins, n_steps)), before, axis=1) * (n_steps / n_fft)
     return Compressed(bins, frequency_hz, envelope, step_s, first / rate_hz - before * step_s, first / rate_hz)
 
 
 def _spectrum(signal: NDArray[np.float32], n_fft: int) -> NDArray[np.complex64]:
-    return np.asarray(scipy.fft.rfft(signal - signal.mean(), n_fft))
+    return np.asarray(fourier.rfft(signal - signal.mean(), n_fft))
 
 
 def strongest(found: Compressed, width_s: float) -> tuple[NDArray[np.float64], float] | None:

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.arrival import Compressed
+from ertis_numba.base import fourier
 
 __all__ = ["Coherence", "aligned", "correlate", "half_bands", "half_gate", "mean_of"]
 
@@ -43,7 +43,7 @@ def aligned(found: Compressed, at_s: NDArray[np.float64], lag_s: float) -> NDArr
     steps = np.arange(-half, half + 1)
     turned = found.bins * np.exp(2j * np.pi * found.frequency_hz * (at_s - found.origin_s)[:, None])
     low_hz, centre_hz = found.frequency_hz[0], found.frequency_hz.mean()
-    signals = scipy.fft.ifft(turned, n_steps, axis=1)[:, steps % n_steps]
+    signals = fourier.ifft(turned, n_steps)[:, steps % n_steps]
     return np.asarray(signals * np.exp(2j * np.pi * (low_hz - centre_hz) * found.step_s * steps))
 
 

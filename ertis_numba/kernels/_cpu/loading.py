@@ -1,6 +1,7 @@
 """Loading of compiled kernels from Numba's cache.
 
-Numba prepares its compiler before it loads a function, a tenth of the processor time of ``ertis process``.
+Before Numba loads a function, it prepares its compiler and looks for extensions in the metadata of all installed
+packages: a tenth of the processor time of ``ertis process``. Only a compilation needs either.
 """
 
 import functools
@@ -8,6 +9,7 @@ import logging
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
+from numba.core import entrypoints
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
@@ -22,6 +24,7 @@ def load_without_compiler(kernels: Iterable[Any]) -> None:
         cache = getattr(kernel, "_cache", None)
         if isinstance(cache, FunctionCache) and hasattr(cache, "_load_overload"):
             cache.load_overload = functools.partial(_load, cache)
+            kernel._compilation_chain_init_hook = _nothing  # noqa: SLF001
             cache.save_overload = functools.partial(_save, cache.save_overload, cache)
 
 
@@ -44,8 +47,19 @@ def _warn_of_compilations(folder: str, reason: str) -> None:
     )
 
 
+def _nothing() -> None:
+    pass
+
+
 def _load(cache: Any, signature: Any, context: Any) -> Any:
     """Return the compiled code for a signature, or None if there is none, like `FunctionCache.load_overload`."""
+    found = _stored(cache, signature, context)
+    if found is None:
+        entrypoints.init_all()
+    return found
+
+
+def _stored(cache: Any, signature: Any, context: Any) -> Any:
     # Numba reads all types before it compares the age of the source; a cache with a renamed type is emptied.
     rtsys.initialize(context)  # registers the functions that compiled code calls
     try:

@@ -6,6 +6,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ertis_numba.kernels.fft._scipy import ScipyTransforms
+
 __all__ = ["Transforms", "plan"]
 
 
@@ -31,8 +33,6 @@ def plan(
 ) -> Transforms:
     """Return the transforms of ``signals`` (mic, n) and ``analytic`` (mic, phase, n_out) in memory of ``zeros``."""
     if library == "scipy":
-        from ertis_numba.kernels.fft._scipy import ScipyTransforms  # noqa: PLC0415 - scipy.fft takes long to import
-
         return ScipyTransforms(signals, analytic)
     from ertis_numba.kernels.fft._cufft import CufftTransforms  # noqa: PLC0415 - CuPy is installed only with GPU support
 

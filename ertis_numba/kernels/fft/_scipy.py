@@ -1,10 +1,9 @@
 """Transforms on the host, with SciPy's pocketfft."""
 
-from typing import cast
-
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
+
+from ertis_numba.base import fourier
 
 __all__ = ["ScipyTransforms"]
 
@@ -17,11 +16,11 @@ class ScipyTransforms:
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:
         """Return the one-sided spectra of the real signals: (mic, n // 2 + 1) complex64."""
-        return cast("NDArray[np.complex64]", scipy.fft.rfft(self._signals, workers=threads))
+        return fourier.rfft(self._signals, workers=threads)
 
     def inverse(self, *, threads: int) -> None:
         """Transform the spectra in the array of analytic signals, (mic, phase, n), to signals in place."""
         spectra = self._analytic
-        result = scipy.fft.ifft(spectra, norm="forward", overwrite_x=True, workers=threads)
+        result = fourier.ifft(spectra, normalised=False, overwrite=True, workers=threads)
         if result is not spectra and not np.shares_memory(result, spectra):
-            spectra[:] = result  # overwrite_x permits in-place work, but does not guarantee it
+            spectra[:] = result  # permitted, but not guaranteed, to be in place
