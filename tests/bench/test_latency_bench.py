@@ -77,6 +77,7 @@ def test_processor_time_separates_threads_of_this_process():
         release.set()
         thread.join()
     assert 45 <= rows["other threads"] < 200
+    assert sum(time_ms for _, kind, time_ms in used.rows(2) if kind == "other threads") >= 45  # The thread has ended.
     assert used.percent()["this"] > 0
 
 

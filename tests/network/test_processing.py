@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import signal
+import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -368,3 +370,18 @@ def test_images_of_no_plan_and_silence_are_not_predicted(is_paper):
     while predictions.busy:
         found += predictions.drain()
     assert found == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has priorities of threads")
+def test_checks_have_a_lower_priority_than_images(monkeypatch):
+    found = []
+    monkeypatch.setattr(
+        Predictions,
+        "_report_sound",
+        lambda *_: found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id())),
+    )
+    predictions = Predictions("cpu")
+    predictions.add("sensor", None, MEASUREMENT)
+    while predictions.busy:
+        predictions.drain()
+    assert found == [19] != [os.getpriority(os.PRIO_PROCESS, threading.get_native_id())]

@@ -1,12 +1,16 @@
 """Processor time of processes by kind of thread; Linux only, and zero elsewhere."""
 
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 __all__ = ["ProcessorTime"]
 
+_OTHERS = "other threads"
+_SCHEDULER = 2  # Kind of clock, in nanoseconds.
 _ZMQ = "ZMQbg"  # Beginning of the names of ZeroMQ's threads, which encrypt, decrypt, send and receive.
 
 
@@ -39,20 +43,31 @@ class ProcessorTime:
 
 
 def _times_ns(pids: Sequence[int]) -> dict[str, int]:
-    """Return the processor time of all threads of some processes, by kind of thread."""
+    """Return the processor time of all threads of some processes, by kind of thread; other threads may have ended."""
     found: dict[str, int] = defaultdict(int)
     for pid in pids:
+        known_ns = 0
         for thread in Path(f"/proc/{pid}/task").glob("[0-9]*"):
             try:
                 name = (thread / "comm").read_text("utf-8")
                 used_ns = int((thread / "schedstat").read_text("ascii").split()[0])
             except (OSError, IndexError):  # The thread has ended meanwhile.
                 continue
-            found[_kind(name, is_main=thread.name == str(pid))] += used_ns
+            kind = _kind(name, is_main=thread.name == str(pid))
+            if kind != _OTHERS:
+                found[kind] += used_ns
+                known_ns += used_ns
+        with suppress(OSError):  # The process has ended meanwhile, or the system has no such times.
+            found[_OTHERS] += max(0, _used_ns(pid) - known_ns)
     return dict(found)
+
+
+def _used_ns(pid: int) -> int:
+    """Return the processor time of a process, including its threads that have ended."""
+    return time.clock_gettime_ns(~pid << 3 | _SCHEDULER) if sys.platform == "linux" else 0  # clock_getcpuclockid(3)
 
 
 def _kind(name: str, *, is_main: bool) -> str:
     if is_main:
         return "main thread"
-    return "ZeroMQ threads" if name.startswith(_ZMQ) else "other threads"
+    return "ZeroMQ threads" if name.startswith(_ZMQ) else _OTHERS

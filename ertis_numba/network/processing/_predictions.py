@@ -1,7 +1,10 @@
 """Checks of measurements and images in a worker: one thread runs them while the worker makes further images."""
 
+import os
+import sys
 import threading
 from collections import deque
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Literal
 
 from ertis_numba.network.processing.pipe_messages import Predicted
@@ -19,6 +22,7 @@ _EVENTS: Final[dict["Subject", Literal["call_mismatch", "start_mismatch", "layou
     "layout": "layout_mismatch",
     "samples": "sample_fault",
 }
+_LOWEST: Final = 19
 
 
 class Predictions:
@@ -79,6 +83,7 @@ class Predictions:
             self._found.append(Predicted(sensor=sensor, event="coarse_grid", warning=text))
 
     def _predict(self, sensor: str, image: "Energyscape | None", measurement: "Measurement") -> None:
+        _yield_to_images()
         if image is not None:
             self._report_grid(sensor, image)
         self._report_sound(sensor, measurement)
@@ -102,3 +107,10 @@ class Predictions:
             text = f"the error of images was not predicted: {type(error).__name__}: {error}"
         if text:
             self._found.append(Predicted(sensor=sensor, event="error_budget", warning=text))
+
+
+def _yield_to_images() -> None:
+    """Give this thread the lowest priority: a check takes as much processor time as a hundred images."""
+    if sys.platform == "linux":  # Elsewhere, only processes have priorities.
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LOWEST)
