@@ -2,11 +2,13 @@
 
 The vehicle stops at once. It drives on only after several images with a clear path, and at a larger distance than the
 one that stops it, so that a flickering echo does not make it jerk. It also stops if one of its sensors sends no image
-for half a second, or if the sensor's clock differs from this machine's by half a second. A point cloud omits echoes
-more than 20 dB below the strongest reflector of an image: a thin pole beside a wall is not detected::
+for half a second, or if the sensor's clock differs from this machine's by half a second. After a near obstacle
+disappears, it waits for a farther echo, because the sensor does not see obstacles nearer than its first range. This is
+no proof: an obstacle that is too near may leave farther ones visible beside it. A point cloud omits echoes more than
+20 dB below the strongest reflector of an image: a thin pole beside a wall is not detected::
 
     ertis serve &
-    ertis capture --port front --to tcp://127.0.0.1:5601 &
+    ertis capture --port front --settings NEAR.toml --to tcp://127.0.0.1:5601 &   # range_m = [0.3, 5.0]
     python examples/2_safety_stop.py tcp://127.0.0.1:5602 front
 """
 
@@ -32,15 +34,19 @@ class Way:
         self.speed = 0
         self._seen_s = -np.inf
         self._clear = 0
+        self._last_m = np.inf  # distance of the last obstacle that was seen
 
     def see(self, nearest_m: float, now_s: float) -> None:
         """Update the speed with the distance of the nearest obstacle."""
         self._seen_s = now_s
+        if nearest_m < np.inf:
+            self._last_m = nearest_m
         allowed = int(nearest_m > STOP_M) + int(nearest_m > SLOW_M)
         if allowed <= self.speed:
             self.speed, self._clear = allowed, 0
             return
-        is_clear = nearest_m > CLEARER * (STOP_M, SLOW_M)[self.speed]
+        is_hidden = nearest_m == np.inf and self._last_m <= STOP_M  # perhaps nearer than the first range
+        is_clear = nearest_m > CLEARER * (STOP_M, SLOW_M)[self.speed] and not is_hidden
         self._clear = self._clear + 1 if is_clear else 0
         if self._clear >= CLEAR_IMAGES:
             self.speed, self._clear = self.speed + 1, 0

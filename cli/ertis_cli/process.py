@@ -9,10 +9,12 @@ import click
 
 from ertis_cli import _image_options, _mountings, _plans, _process_many, _results, options
 from ertis_cli._help_sections import SectionedCommand
+from ertis_numba.base.constants import IMAGE_DTYPES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ertis_numba.base.constants import ImageDtype
     from ertis_numba.campaign import CampaignOptions
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import ExcludedChannels, Settings
@@ -57,11 +59,11 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @options.settings_file
 @click.option(
     "--dtype",
-    type=click.Choice(["float32", "float16"]),
+    type=click.Choice(IMAGE_DTYPES),
     default="float32",
     show_default=True,
     help="Data type of images. float16 halves the file; it keeps three digits down to -84 dBFS and fewer below, and "
-    "netCDF programs cannot read it.",
+    "netCDF programs cannot read it. uint8 quarters the file; it stores levels from -122 to 5 dBFS in steps of 0.5 dB.",
 )
 @_process_many.processing
 @_mountings.mounting
@@ -79,7 +81,7 @@ def process(
     explain: bool,
     verify: bool,
     settings_file: Path | None,
-    dtype: Literal["float32", "float16"],
+    dtype: "ImageDtype",
     strict: bool,
     device: str,
     threads: int | None,

@@ -8,10 +8,12 @@ import click
 from ertis_cli import _central_watch, _image_options, _network, _plans, _supervisor, options
 from ertis_cli._config import typed
 from ertis_cli._saving import withdrawn
+from ertis_numba.base.constants import IMAGE_DTYPES
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from ertis_numba.base.constants import ImageDtype
     from ertis_numba.settings import ExcludedChannels
 
 __all__ = ["serve"]
@@ -45,10 +47,10 @@ __all__ = ["serve"]
 @options.device
 @click.option(
     "--dtype",
-    type=click.Choice(["float32", "float16"]),
+    type=click.Choice(IMAGE_DTYPES),
     default="float32",
     show_default=True,
-    help="Data type of published images; float16 halves their size.",
+    help="Data type of published images; float16 halves their size, and uint8, levels in steps of 0.5 dB, quarters it.",
 )
 @click.option(
     "--deadline",
@@ -87,7 +89,7 @@ def serve(
     max_error_db: float | None,
     plan: Literal["nominal", "measured"],
     device: str,
-    dtype: Literal["float32", "float16"],
+    dtype: "ImageDtype",
     deadline: float,
     quarantine: Path | None,
     duration: float | None,

@@ -8,6 +8,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.noise import audible
 from ertis_numba.analysis.range_cleaning import clean
 from ertis_numba.analysis.side_lobes import SIDE_LOBE_DB
 from ertis_numba.base import checks
@@ -74,7 +75,7 @@ def cfar(
         )
     factor = threshold_factor(method, n_reference, false_alarm)
     places = _reference(image, n_reference)
-    amplitude = image.amplitude
+    amplitude = audible(image, image.amplitude)
     if method == "ordered_statistic":
         # A bin exceeds a multiple of the k-th lowest reference bin if it exceeds that multiple of k bins. This needs no
         # sorting.

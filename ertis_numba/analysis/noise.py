@@ -12,7 +12,7 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Processing
 
-__all__ = ["EchoFloor", "echo_floor", "medians_of", "noise_of", "threshold_of"]
+__all__ = ["EchoFloor", "audible", "echo_floor", "medians_of", "noise_of", "threshold_of"]
 
 _ROUNDING = 10 ** (-140 / 20)  # For one-bit microphones: their noise is at least 40 dB above, arithmetic 10 dB below.
 _SAMPLE = 32_768  # Number of bins from which the noise is estimated, with an accuracy of 1 %.
@@ -72,7 +72,7 @@ def noise_of(image: Energyscape) -> float:
     processing = image.settings.processing
     if processing.is_adaptive or processing.is_cleaned or not image.amplitude.size:
         return 0.0
-    some = image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)]
+    some = audible(image, image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)])
     level = float(_quiet(_medians_of_blocks(some, min(_BLOCKS, some.shape[1]))[None])[0])
     return level / math.sqrt(math.log(2))
 
@@ -129,7 +129,7 @@ def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
         strongest = amplitude.max(axis=0, keepdims=True)
         median = _quiet(_medians_of_blocks(strongest, min(_BLOCKS, n_ranges))[None])
     else:
-        some = amplitude[:, :: max(1, amplitude.size // _DENSE)]
+        some = audible(image, amplitude[:, :: max(1, amplitude.size // _DENSE)])
         width = max(1, some.shape[1] // _LONG_BLOCKS)
         blocks = some[:, : some.shape[1] // width * width].copy().reshape(-1, width)
         medians = _medians_in_place(blocks).reshape(n_directions, -1)
@@ -141,18 +141,25 @@ def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
     n_around = max(_LEAST, min(n_ranges, round(spread_m / step_m))) if step_m else 1
     return EchoFloor(
         np.broadcast_to(np.maximum(smallest, ratio * median).astype(np.float32), n_directions),
-        (ratio * _medians_by_range(amplitude, n_around)).astype(np.float32),
+        (ratio * _medians_by_range(image, n_around)).astype(np.float32),
         n_around,
         ratio,
         exponent,
     )
 
 
-def _medians_by_range(amplitude: NDArray[np.float32], n_around: int) -> NDArray[np.float32]:
+def audible(image: Energyscape, some: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return some amplitudes of an image, at least its lowest 8-bit level, because zeros are levels below it."""
+    heard = some[some > 0] if image.level_step_db and not image.settings.processing.is_cleaned else some[:0]
+    return np.maximum(some, heard.min()) if heard.size else some
+
+
+def _medians_by_range(image: Energyscape, n_around: int) -> NDArray[np.float32]:
     """Return the highest median of the blocks of ranges around each range: (range,) float32."""
-    n_ranges = amplitude.shape[1]
+    n_ranges = len(image.range_m)
     n_blocks = max(1, _PER_CALL * n_ranges // n_around)
-    medians = _medians_of_blocks(amplitude[:: max(1, amplitude.size // _SAMPLE)], n_blocks)
+    some = audible(image, image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)])
+    medians = _medians_of_blocks(some, n_blocks)
     padded = np.pad(medians, 1, mode="edge")
     around = np.maximum(medians, np.maximum(padded[:-2], padded[2:]))
     width, n_longer = divmod(n_ranges, n_blocks)

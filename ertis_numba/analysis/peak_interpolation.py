@@ -12,6 +12,7 @@ from ertis_numba.analysis.plan_errors import plan_error
 from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
+from ertis_numba.frames.level_codes import rounding_np
 from ertis_numba.settings import Settings
 
 __all__ = ["PeakInterpolator", "Tops", "listed"]
@@ -82,8 +83,10 @@ class PeakInterpolator:
         row, is_sparse, misfit = self._row[directions], np.zeros(len(found), np.bool_), np.zeros(len(found))
         is_fitted = self._echoes is not None
         if self._echoes is not None:
+            # A rounded level changes the magnitude alone, but half of the power of an error of the model.
+            model = math.hypot(self._model, math.sqrt(2) * rounding_np(image.level_step_db))
             shift_m, offset, level, *sds, is_sparse, misfit = self._echoes(
-                image, row, rows, columns, found, noise=noise, model=self._model
+                image, row, rows, columns, found, noise=noise, model=model
             )
             sd = np.array(sds)
         within_m = shift_m.clip(-0.5 * step_m, 0.5 * step_m)

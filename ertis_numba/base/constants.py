@@ -1,10 +1,11 @@
 """Physical constants, properties of the eRTIS hardware, and limits, each with its source."""
 
-from typing import Final
+from typing import Final, Literal, TypeAlias, get_args
 
 __all__ = [
     "ERTIS_PDM_RATE_HZ",
     "FALSE_ALARM",
+    "IMAGE_DTYPES",
     "MAX_MICROPHONES",
     "MAX_NAME_LENGTH",
     "SHAPED_NOISE_SHARE",
@@ -13,6 +14,7 @@ __all__ = [
     "STANDARD_TEMPERATURE_C",
     "SYNC_STEP_S",
     "WORD_BITS",
+    "ImageDtype",
 ]
 
 STANDARD_TEMPERATURE_C: Final = 20.0
@@ -33,3 +35,7 @@ MAX_NAME_LENGTH: Final = (
     4096  # characters of a name or path in settings: PATH_MAX of Linux; the limit of HDF5 is 65,536 bytes
 )
 WORD_BITS: Final = (8, 16, 32, 64)
+
+ImageDtype: TypeAlias = Literal["float32", "float16", "uint8"]
+IMAGE_DTYPES: Final[tuple[ImageDtype, ...]] = get_args(ImageDtype)
+"""Data types of stored and published images."""

@@ -7,6 +7,7 @@ from typing import Any, Final, Literal, Protocol, TypeAlias
 import msgspec
 
 from ertis_numba.base import checks
+from ertis_numba.base.constants import IMAGE_DTYPES, ImageDtype
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.campaign.recordings import RESULT_SUFFIXES, ResultKind
 from ertis_numba.chain.costs import PLAN_COSTS, PlanCosts
@@ -43,7 +44,7 @@ class CampaignOptions:
         Channels to exclude from processing, of all sensors or of some; none by default.
     sensor : str, optional
         Name of the only sensor to process; all sensors by default.
-    dtype : {"float32", "float16"}
+    dtype : {"float32", "float16", "uint8"}
         Type of the stored amplitudes of images, by default float32.
     device : {"auto", "cpu", "cuda", "numpy"}
         Compute device, by default ``auto``.
@@ -73,7 +74,7 @@ class CampaignOptions:
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
     without: ExcludedChannels = field(default_factory=ExcludedChannels)
     sensor: str | None = None
-    dtype: Literal["float32", "float16"] = "float32"
+    dtype: ImageDtype = "float32"
     device: str = "auto"
     plan: PlanCosts = "nominal"
     threads: int | None = None
@@ -86,7 +87,7 @@ class CampaignOptions:
     result: ResultKind = "energyscape"
 
     def __post_init__(self) -> None:
-        checks.choice("dtype", self.dtype, ("float32", "float16"))
+        checks.choice("dtype", self.dtype, IMAGE_DTYPES)
         checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.integer("batch", self.batch, 1)

@@ -50,6 +50,9 @@ class Energyscape(DegreesFromRadians):
     points : PointCloud, optional
         Reflectors that the fusion of several sensors has located, in the frame of the platform; None for the image of
         one sensor. Lists, plots, exports and views show these points in place of maxima of the image.
+    level_step_db : float
+        Step to which levels were rounded in a file or message of type uint8; 0 if they were not. Amplitudes below its
+        lowest level are 0.
 
     Raises
     ------
@@ -74,6 +77,7 @@ class Energyscape(DegreesFromRadians):
     settings: Settings
     stamp: Stamp = Stamp()
     points: PointCloud | None = None
+    level_step_db: float = 0.0
 
     _repr_html_ = shown_in_notebooks
 

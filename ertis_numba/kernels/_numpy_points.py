@@ -11,6 +11,7 @@ from ertis_numba.kernels._numpy_echo_fits import fit_echoes, pulse_at
 __all__ = ["KERNELS"]
 
 Floats = NDArray[np.float32]
+_BLOCK = 2**15  # fits into the cache
 
 
 def spread_amplitudes(pulse: Pulse, path_m: Doubles, out: Doubles) -> None:
@@ -78,10 +79,20 @@ def _slopes(around: Floats, middle: int, fallen: np.float32) -> NDArray[np.bool_
     return found
 
 
+def encode_levels(bits: NDArray[np.int32], floor: np.float32, per_octave: np.float32, out: NDArray[np.uint8]) -> None:
+    """Round levels to codes."""
+    for first in range(0, len(out), _BLOCK):
+        part = bits[first : first + _BLOCK]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            code = (np.log2(part.view(np.float32)) - floor) * per_octave + np.float32(1.5)
+        out[first : first + _BLOCK] = np.where((part < 0) | np.isnan(code), 255, code.clip(0, 255))
+
+
 KERNELS = PointKernels(
     spread_amplitudes=spread_amplitudes,
     find_tops=find_tops,
     interpolate_tops=interpolate_tops,
     fit_echoes=fit_echoes,
     noise_around=noise_around,
+    encode_levels=encode_levels,
 )

@@ -4,6 +4,7 @@ from typing import Annotated, Final, Literal, TypeAlias, get_args
 
 from msgspec import Meta
 
+from ertis_numba.base.constants import ImageDtype
 from ertis_numba.network.message_fields import (
     Count,
     Int64,
@@ -75,17 +76,23 @@ class MeasuredProduct(OfMeasurement, frozen=True, kw_only=True):
     description: Count
 
 
-class Image(MeasuredProduct, frozen=True, kw_only=True):
-    """An energyscape. Payloads: its amplitudes, little-endian, cut into frames."""
+class Image(MeasuredProduct, frozen=True, kw_only=True, omit_defaults=True):
+    """An energyscape. Payloads: its amplitudes, little-endian, cut into frames.
+
+    With the dtype ``uint8``, they are levels: code c from 1 to 255 is ``floor_db + (c - 1) * step_db`` dBFS, and 0 is
+    more than half a step below ``floor_db``, or no sound. Other types lack both fields.
+    """
 
     routes = (("publisher", "application"),)
     payload = "amplitude, in frames of 512 KiB"
     product = "energyscape"
 
     shape: tuple[Count, Count]  # (direction, range)
-    dtype: Literal["float32", "float16"]
+    dtype: ImageDtype
     received_ns: Int64  # arrival of the measurement, by a monotonic clock of the central node
     published_ns: Int64  # departure of the image, by the same clock
+    floor_db: float | None = None
+    step_db: float | None = None
 
 
 class Points(MeasuredProduct, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
+from ertis_numba.frames.level_codes import LevelCodes
 from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import received_settings
 from ertis_numba.network.messages import Description, Group, Image, Message, Points, Raw, Report
@@ -122,8 +123,19 @@ def _image(reader: ProductReader, header: Image, payload: Payload) -> Energyscap
     wanted = (len(azimuth_rad), len(range_m))
     if header.shape != wanted or len(elevation_rad) != len(azimuth_rad):
         raise DataError(f"an image has shape {header.shape}, but its axes give {wanted}; send matching axes")
-    amplitude = _array(payload, header.shape, header.dtype).astype(np.float32, copy=False)
-    return Energyscape(amplitude, azimuth_rad, elevation_rad, range_m, described.settings, header.stamp)
+    amplitude, step_db = _array(payload, header.shape, header.dtype), 0.0
+    if header.dtype == "uint8":
+        levels = LevelCodes.checked(header.floor_db, header.step_db, "an image")
+        amplitude, step_db = levels.decode(amplitude), levels.step_db
+    return Energyscape(
+        amplitude.astype(np.float32, copy=False),
+        azimuth_rad,
+        elevation_rad,
+        range_m,
+        described.settings,
+        header.stamp,
+        level_step_db=step_db,
+    )
 
 
 def _points(reader: ProductReader, header: Points, payload: Payload) -> PointCloud:

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import ClassVar, Self, TypeVar, overload
+from typing import BinaryIO, ClassVar, Self, TypeVar, overload
 
 import h5py
 
@@ -15,7 +15,7 @@ from ertis_numba.base.file_kinds import kind_of, problem_of, quoted
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage.opening import RESULT_OR_RECORDING, open_file, reading
+from ertis_numba.storage.opening import RESULT_OR_RECORDING, open_binary, open_file, reading
 from ertis_numba.storage.schema import FORMAT_VERSION, OLDEST_VERSION, Variable, content_sha256
 from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import GroundTruth, read_truth
@@ -39,7 +39,7 @@ def file_kind(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> str:
         return _kind(file, Path(path), wanted)
 
 
-def sensor_names(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> tuple[str, ...]:
+def sensor_names(path: str | Path | BinaryIO, wanted: str = RESULT_OR_RECORDING) -> tuple[str, ...]:
     """Return the names of the sensors in a recording or a result of processing, in the order of the file.
 
     Raises
@@ -47,8 +47,9 @@ def sensor_names(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> tuple[s
     DataError
         The file cannot be read, or is of another kind.
     """
-    with open_file(Path(path), wanted) as file, reading(file, Path(path)):
-        _kind(file, Path(path), wanted)
+    place = _place(path)
+    with _opened(path, wanted) as file, reading(file, place):
+        _kind(file, place, wanted)
         return sensors_of(file)
 
 
@@ -60,7 +61,7 @@ class FileReader(Sequence[Item]):
     Attributes
     ----------
     path : Path
-        Path of the file.
+        Path of the file, or the name of the file object.
     sensor : str
         Sensor of these rows.
     sensors : tuple of str
@@ -78,9 +79,10 @@ class FileReader(Sequence[Item]):
     _data: str
     _table: tuple[Variable, ...]
 
-    def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
-        self.path = Path(path)
-        self._file = open_file(self.path, _KIND_NAMES[self._kind])
+    def __init__(self, path: str | Path | BinaryIO, *, sensor: str | None = None) -> None:
+        self.path = _place(path)
+        self._binary = None if isinstance(path, str | Path) else path
+        self._file = _opened(path, _KIND_NAMES[self._kind])
         try:
             with self._reading():
                 self._require_kind()
@@ -124,8 +126,14 @@ class FileReader(Sequence[Item]):
 
     def sha256(self) -> str:
         """Return the SHA-256 of the file, in hexadecimal."""
-        with self.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        if self._binary is None:
+            with self.path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        digest = hashlib.sha256()
+        self._binary.seek(0)
+        while block := self._binary.read(2**20):
+            digest.update(block)
+        return digest.hexdigest()
 
     def stamps(self) -> list[Stamp]:
         """Return the stamps of all measurements, without reading the measurements."""
@@ -223,6 +231,18 @@ class FileReader(Sequence[Item]):
                 f"{self.path}: the content of sensor {self.sensor} has SHA-256 {got[:8]}…, but the file states "
                 f"{str(wanted)[:8]}…: the file is damaged; copy it again"
             )
+
+
+def _place(path: str | Path | BinaryIO) -> Path:
+    """Return the path of a file, or the last part of the name of a file object; those of fsspec have a ``path``."""
+    if isinstance(path, str | Path):
+        return Path(path)
+    names = (getattr(path, each, None) for each in ("path", "name"))  # a pipe has a number as its name
+    return Path(next((Path(name).name for name in names if isinstance(name, str)), "file object"))
+
+
+def _opened(path: str | Path | BinaryIO, wanted: str) -> h5py.File:
+    return open_file(Path(path), wanted) if isinstance(path, str | Path) else open_binary(path, _place(path), wanted)
 
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:

@@ -36,14 +36,16 @@ class ResultFile:
     """Declaration of a kind of file, which its writer and its reader inherit.
 
     ``_kind``, ``_data`` and ``_table`` are as for `FileWriter`; the table ends with the variables of poses. ``_type``
-    is the class of a row, and ``_name`` its name in errors, with its article. ``_axes`` has the field of a row by the
-    variable that stores it once, and ``_columns`` by the variable with one number per row. ``_lengths`` has the length
-    of each axis of the table: a number, or a variable that has this first axis.
+    is the class of a row, ``_values`` the field of its array, and ``_name`` its name in errors, with its article.
+    ``_axes`` has the field of a row by the variable that stores it once, and ``_columns`` by the variable with one
+    number per row. ``_lengths`` has the length of each axis of the table: a number, or a variable that has this first
+    axis.
     """
 
     _kind: ClassVar[str]
-    _data: ClassVar[str]
-    _table: ClassVar[tuple[Variable, ...]]
+    _data: str
+    _values: ClassVar[str]
+    _table: tuple[Variable, ...]
     _type: ClassVar[type[Any]]
     _name: ClassVar[str]
     _axes: ClassVar[Mapping[str, str]]
@@ -123,7 +125,7 @@ class ResultWriter(ResultFile, FileWriter[Result]):
             ours, theirs = getattr(item, field), getattr(first, field)
             if ours is not theirs and not np.array_equal(ours, theirs):
                 raise ArgumentError(f"{field} of {self._name} differs from that of the first; write it to another file")
-        return getattr(item, self._data), {name: getattr(item, field) for name, field in self._columns.items()}
+        return getattr(item, self._values), {name: getattr(item, field) for name, field in self._columns.items()}
 
     def _finish(self, file: h5py.File) -> None:
         super()._finish(file)
@@ -172,9 +174,13 @@ class ResultReader(ResultFile, FileReader[Result], DegreesFromRadians):
     def _sizes(self) -> dict[str, int]:
         return {**self._sizes_of(self._group), **POSE_SIZES}
 
+    def _values_of(self, row: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the array of a row as stored in single precision."""
+        return row.astype(np.float32, copy=False)
+
     def _item(self, index: int) -> Result:
         fields = {
-            self._data: self._rows.row(index).astype(np.float32, copy=False),
+            self._values: self._values_of(self._rows.row(index)),
             **{field: getattr(self, field) for field in self._axes.values()},
             **{field: self._rows.column(name, index) for name, field in self._columns.items() if name in self._group},
         }

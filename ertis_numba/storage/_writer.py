@@ -54,8 +54,8 @@ class FileWriter(ABC, Generic[Item]):
     """
 
     _kind: ClassVar[str]
-    _data: ClassVar[str]
-    _table: ClassVar[tuple[Variable, ...]]
+    _data: str
+    _table: tuple[Variable, ...]
     _numbered: ClassVar[bool]
     _part_token: ClassVar[str | None] = None
 

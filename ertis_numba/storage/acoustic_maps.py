@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, BinaryIO, ClassVar, Final
 
 import h5py
 import numpy as np
@@ -88,8 +88,9 @@ class BearingReader:
 
 class _AcousticMapFile(ResultFile):
     _kind: ClassVar[str] = "acoustic_map"
-    _data: ClassVar[str] = "power"
-    _table: ClassVar[tuple[Variable, ...]] = (*ACOUSTIC_MAP, *BEARINGS, *POSES)
+    _data: str = "power"
+    _values: ClassVar[str] = "power"
+    _table: tuple[Variable, ...] = (*ACOUSTIC_MAP, *BEARINGS, *POSES)
     _type: ClassVar[type[Any]] = AcousticMap
     _name: ClassVar[str] = "an acoustic map"
     _axes: ClassVar[Mapping[str, str]] = {
@@ -207,12 +208,13 @@ class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
         return super()._sizes() | BEARING_SIZES
 
 
-def open_acoustic_maps(path: str | Path, *, sensor: str | None = None) -> AcousticMapReader:
+def open_acoustic_maps(path: str | Path | BinaryIO, *, sensor: str | None = None) -> AcousticMapReader:
     """Open a file of acoustic maps for reading.
 
     Parameters
     ----------
-    path : str or Path
+    path : str, Path or binary file
+        As for `open_recording`.
     sensor : str, optional
         Name of the sensor, if the file contains several.
 

@@ -5,22 +5,35 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, Literal
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base import checks
+from ertis_numba.base.constants import IMAGE_DTYPES, ImageDtype
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.storage._levels import encoded, levels_for, levels_of, stored_levels
 from ertis_numba.storage._points import POINT_SIZES, PointReader, require_uniform, write_points
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
 from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, FORMAT_VERSION, POINTS, POSES, Variable
+from ertis_numba.storage.schema import (
+    ENERGYSCAPE,
+    ENERGYSCAPE_OF_LEVELS,
+    FORMAT_VERSION,
+    LEVELS,
+    POINTS,
+    POSES,
+    Variable,
+)
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 from ertis_numba.storage.variables import set_attributes, to_python
+
+if TYPE_CHECKING:
+    from ertis_numba.frames.level_codes import LevelCodes
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
@@ -38,12 +51,19 @@ _TEXTS: Final = (
 
 class _EnergyscapeFile(ResultFile):
     _kind: ClassVar[str] = "energyscape"
-    _data: ClassVar[str] = "amplitude"
-    _table: ClassVar[tuple[Variable, ...]] = (*ENERGYSCAPE, *POINTS, *POSES)
+    _data: str = "amplitude"
+    _values: ClassVar[str] = "amplitude"
+    _table: tuple[Variable, ...] = (*ENERGYSCAPE, *POINTS, *POSES)
     _type: ClassVar[type[Any]] = Energyscape
     _name: ClassVar[str] = "an energyscape"
     _axes: ClassVar[Mapping[str, str]] = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m"}
     _lengths: ClassVar[Mapping[str, int | str]] = {"direction": "azimuth", "range": "range"}
+
+    def _choose_table(self, *, is_levels: bool) -> None:
+        """Choose the variable of the images."""
+        self._is_levels = is_levels
+        if is_levels:
+            self._data, self._table = LEVELS.name, (*ENERGYSCAPE_OF_LEVELS, *POINTS, *POSES)
 
 
 class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
@@ -64,9 +84,10 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mounting by name of the sensor, as for `RecordingWriter`, instead of that of the recording. By default, the file
         stores the mountings that the recording contains.
-    dtype : {"float32", "float16"}
-        Type of the stored amplitudes. float16 halves the file; it has three digits down to -84 dBFS and fewer below.
-        netCDF programs cannot read it.
+    dtype : {"float32", "float16", "uint8"}
+        Type of the stored images. float16 halves the file; it has three digits down to -84 dBFS and fewer below.
+        netCDF programs cannot read it. uint8 stores levels in steps of 0.5 dB, in a quarter of the bytes, usually from
+        -122 to 5 dBFS. The first image of a sensor selects other limits if it is louder or very quiet.
     overwrite : bool
         Replace an existing file.
     """
@@ -78,11 +99,13 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         recording: RecordingReader | Sequence[RecordingReader] | None = None,
         truth: Mapping[str, GroundTruth] | None = None,
         mounting: Mapping[str, Mounting] | None = None,
-        dtype: Literal["float32", "float16"] = "float32",
+        dtype: ImageDtype = "float32",
         overwrite: bool = False,
     ) -> None:
-        checks.choice("dtype", dtype, ("float32", "float16"))
+        checks.choice("dtype", dtype, IMAGE_DTYPES)
+        self._levels: dict[str, LevelCodes] = {}
         super().__init__(path, recording=recording, mounting=mounting, dtype=dtype, overwrite=overwrite, truth=truth)
+        self._choose_table(is_levels=dtype == "uint8")
         self._points: dict[str, list[PointCloud]] = {}
         self._stated: dict[str, dict[str, float | str]] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in self._readers if reader.truth}
@@ -162,13 +185,26 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         super()._begin(group, first)
         set_attributes(group, self._stated.get(first.stamp.sensor, {}))
+        if self._is_levels:
+            self._levels[first.stamp.sensor] = levels = levels_for(first)
+            set_attributes(group[self._data], stored_levels(levels))
+        elif first.level_step_db:
+            set_attributes(group, {"level_step_db": first.level_step_db})
 
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
-        require_uniform(item, self._first[item.stamp.sensor])
-        row = super()._row(item)
+        first = self._first[item.stamp.sensor]
+        require_uniform(item, first)
+        if item.level_step_db != first.level_step_db:
+            raise ArgumentError(
+                f"level_step_db of an energyscape is {item.level_step_db:g}, but that of the first is "
+                f"{first.level_step_db:g}; write it to another file"
+            )
+        row, columns = super()._row(item)
+        if self._is_levels:
+            row = encoded(item, self._levels[item.stamp.sensor])
         if item.points is not None:
             self._points.setdefault(item.stamp.sensor, []).append(item.points)
-        return row
+        return row, columns
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         sensor = group.name.rpartition("/")[2]
@@ -242,6 +278,8 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
         Warning that records do not begin with the emission; empty if they may, or if it was not examined.
     layout_warning : str
         Warning that echoes do not match the layout; empty if they may, or if it was not examined.
+    level_step_db : float
+        Step to which levels were rounded, of images that are or were of type uint8; 0 if they were not.
     samples_warning : str
         Warning that measurements have dropouts or are copies; empty if not, or if it was not examined.
     """
@@ -256,10 +294,17 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     layout_warning: str
     samples_warning: str
     wavefront_error_db: float | None
+    level_step_db: float
+
+    def _select_table(self) -> None:
+        self._choose_table(is_levels=LEVELS.name in self._group)
 
     def _load(self) -> None:
         super()._load()
         stated = self._group.attrs
+        self._levels = levels_of(self._group[self._data], self.path) if self._is_levels else None
+        step_db = self._levels.step_db if self._levels else stated.get("level_step_db", 0.0)
+        self.level_step_db = _number(self.path, "level_step_db", step_db)
         for name in _ERRORS_DB:
             setattr(self, name, _number(self.path, name, stated[name]) if name in stated else None)
         for name in _TEXTS:
@@ -282,8 +327,11 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
             "of which may be ghosts; fuse the recordings again with 'ertis fuse'"
         )
 
+    def _values_of(self, row: NDArray[Any]) -> NDArray[np.float32]:
+        return super()._values_of(row) if self._levels is None else self._levels.decode(row)
+
     def _item(self, index: int) -> Energyscape:
-        image = super()._item(index)
+        image = replace(super()._item(index), level_step_db=self.level_step_db)
         return image if self._points is None else self._points(image, index)
 
     def _sizes(self) -> dict[str, int]:
@@ -300,12 +348,13 @@ def _number(path: Path, name: str, value: Any) -> float:
     return found
 
 
-def open_energyscapes(path: str | Path, *, sensor: str | None = None) -> EnergyscapeReader:
+def open_energyscapes(path: str | Path | BinaryIO, *, sensor: str | None = None) -> EnergyscapeReader:
     """Open an energyscape file for reading.
 
     Parameters
     ----------
-    path : str or Path
+    path : str, Path or binary file
+        As for `open_recording`.
     sensor : str, optional
         Name of the sensor, if the file contains several.
 
@@ -336,7 +385,7 @@ def write_energyscapes(
     recording: RecordingReader | Sequence[RecordingReader] | None = None,
     truth: Mapping[str, GroundTruth] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
-    dtype: Literal["float32", "float16"] = "float32",
+    dtype: ImageDtype = "float32",
     overwrite: bool = False,
 ) -> Path:
     """Write an energyscape file.

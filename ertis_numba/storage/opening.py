@@ -7,14 +7,14 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import h5py
 
 from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, SettingsError
 from ertis_numba.base.file_kinds import HDF5_PLACES, HDF5_SIGNATURE, problem_of, quoted
 
-__all__ = ["RESULT_OR_RECORDING", "open_file", "reading"]
+__all__ = ["RESULT_OR_RECORDING", "open_binary", "open_file", "reading"]
 
 RESULT_OR_RECORDING: Final = "a recording, an energyscape file or a file of acoustic maps"
 # Errors of h5py for damaged files, and for types and values that this package does not expect.
@@ -42,6 +42,8 @@ def reading(file: h5py.File, path: Path) -> Iterator[None]:
     except _DAMAGED as error:
         if not file:
             raise DataError(f"{path} is closed; open it again") from error
+        if isinstance(error, OSError) and error.errno is not None:  # raised by a file object, not by HDF5
+            raise DataError(f"{path} cannot be read ({error.strerror or error}); check its connection") from error
         reported = _SYSTEM_ERROR.search(str(error))
         if reported and int(reported[1]) in _TRANSIENT_ERRNOS:
             raise DataError(f"{path} cannot be read ({reported[2]}); check the disk") from error
@@ -101,6 +103,16 @@ def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
         stored = _STORED_END.search(str(error))
         amount = f" of {stored[1]}" if stored else ""
         raise DataError(f"{path} is cut short or damaged: it has {n_bytes}{amount} bytes; copy it again") from error
+
+
+def open_binary(file: BinaryIO, path: Path, wanted: str) -> h5py.File:
+    """Open an HDF5 file through a binary file object, such as one of fsspec; ``path`` names it in errors."""
+    if not (file.seekable() and file.readable() and isinstance(file.read(0), bytes)):
+        raise DataError(f"{path} is not a binary file that can be read at any place; open a seekable one, mode 'rb'")
+    try:
+        return h5py.File(file, "r")
+    except OSError as error:
+        raise DataError(f"{path} is not {wanted}, or is cut short ({_reason(error)}); copy it again") from error
 
 
 def _is_left_open(path: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, BinaryIO, ClassVar
 
 import h5py
 import numpy as np
@@ -124,13 +124,13 @@ class RecordingReader(FileReader[Measurement]):
                 )
 
 
-def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingReader:
+def open_recording(path: str | Path | BinaryIO, *, sensor: str | None = None) -> RecordingReader:
     """Open a recording for reading.
 
     Parameters
     ----------
-    path : str or Path
-        Path of the file.
+    path : str, Path or binary file
+        Path of the file, or a file object that can seek, as from `fsspec.open`, to read parts of remote files.
     sensor : str, optional
         Name of the sensor; required if the file contains several.
 
@@ -187,8 +187,8 @@ class RecordingWriter(FileWriter[Measurement]):
     """
 
     _kind: ClassVar[str] = "recording"
-    _data: ClassVar[str] = "pdm"
-    _table: ClassVar[tuple[Variable, ...]] = (*RECORDING, *POSES)
+    _data: str = "pdm"
+    _table: tuple[Variable, ...] = (*RECORDING, *POSES)
     _numbered: ClassVar[bool] = True
 
     def __init__(

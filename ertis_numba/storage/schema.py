@@ -26,6 +26,7 @@ __all__ = [
     "CHUNK_ROWS",
     "CONVENTIONS",
     "ENERGYSCAPE",
+    "ENERGYSCAPE_OF_LEVELS",
     "FORMAT_VERSION",
     "OCCUPANCY_MAP",
     "OLDEST_VERSION",
@@ -156,6 +157,22 @@ ENERGYSCAPE: Final = (
     Variable("elevation", ("direction",), "<f8", "elevation, from the horizontal plane towards z", "radian"),
     Variable("range", ("range",), "<f8", "half of the sound path", "m"),
     _SETTINGS,
+)
+
+LEVELS: Final = Variable(
+    "level",
+    ("time", "direction", "range"),
+    "|u1",
+    "level of the envelope; 0 dB is a full-scale echo in every microphone, and the fill value is below all levels",
+    "dB",
+)
+"""Variable of images of 8-bit levels, in place of ``amplitude``."""
+
+ENERGYSCAPE_OF_LEVELS: Final = (
+    *STAMPS[:-1],
+    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of level, as its bytes lie in the file"),
+    LEVELS,
+    *ENERGYSCAPE[len(STAMPS) + 1 :],
 )
 
 ACOUSTIC_MAP: Final = (

@@ -1,16 +1,20 @@
 """Peak detection in images computed from closed forms."""
 
+import math
+
 import numpy as np
 import pytest
 
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.noise import noise_of
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape
+from ertis_numba.frames.level_codes import LevelCodes
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.geometry.waveform import matched_filter_spectrum
-from ertis_numba.settings import Processing, Settings
+from ertis_numba.settings import Processing, Recording, Settings
 
 
 def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0, settings=None):
@@ -150,3 +154,18 @@ def test_find_peaks_accepts_silence_and_small_images(shape):
 def test_find_peaks_rejects_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):
         find_peaks(image_of([]), **arguments)
+
+
+def test_noise_below_the_lowest_level_yields_no_reflectors():
+    """Zeros of 8-bit levels are noise below the floor, so the lowest level takes its place."""
+    settings = Settings(recording=Recording(encoding="float32"))
+    given = image_of([], settings=settings)
+    noise = np.random.default_rng(8).rayleigh(size=given.amplitude.shape) * 4e-7
+    levels = LevelCodes(-122.0)
+    amplitude = levels.decode(levels.encode(noise.astype(np.float32)))
+    rounded = given.replace(amplitude=amplitude, level_step_db=levels.step_db)
+    assert np.median(amplitude) == 0
+    assert amplitude.any()
+    assert find_peaks(rounded) == []
+    assert noise_of(rounded) == pytest.approx(10 ** (-122 / 20) / math.sqrt(math.log(2)), rel=0.01)
+    assert find_peaks(rounded.replace(level_step_db=0.0))

@@ -20,6 +20,19 @@ CASES = {
     "bits": Case("2d:91", 30, encoding="pdm", **MIDDLE),
 }
 DRAWS = 30
+IN_LEVELS = {
+    "coarse": CASES["coarse"],
+    "fine": CASES["fine"],
+    "fine line": Case("2d:181", 60, **MIDDLE),
+    "edges": CASES["edges"],
+    "bits": CASES["bits"],
+}
+
+
+def rounded(image):
+    """The image with levels in steps of 0.5 dB, rounded here."""
+    level_db = np.rint(2 * 20 * np.log10(np.maximum(image.amplitude.astype(np.float64), 1e-9))) / 2
+    return image.replace(amplitude=(10 ** (level_db / 20)).astype(np.float32), level_step_db=0.5)
 
 
 def sideways(azimuth_deg, elevation_deg, positions_m, is_planar):
@@ -31,9 +44,10 @@ def sideways(azimuth_deg, elevation_deg, positions_m, is_planar):
     return np.linalg.eigh(np.cov(across @ positions_m.T))[1][:, 0] @ across
 
 
-def standardised(draws, rng):
+def standardised(draws, rng, change=lambda image: image):
     """Errors of range, direction and level in stated standard deviations; None if no direction or no peak is stated."""
     image, (azimuth_deg, elevation_deg, range_m) = draws.drawn(rng)
+    image = change(image)
     peaks = find_peaks(image, top=3, false_alarm=1e-3)
     near = [peak for peak in peaks if abs(peak.range_m - range_m) < 0.03]
     if not near or not math.isfinite(near[0].grid_error_deg):
@@ -73,6 +87,17 @@ def test_errors_of_each_case_are_about_those_that_are_stated(errors, name):
     assert len(errors[name]) > DRAWS / 2
     assert (rms > 0.6).all()
     assert (rms < 1.5).all()
+
+
+@pytest.mark.parametrize("name", IN_LEVELS)
+def test_errors_of_rounded_levels_are_part_of_those_that_are_stated(name):
+    draws, rng = Draws(IN_LEVELS[name]), np.random.default_rng([31, len(name)])
+    found = np.array([each for _ in range(DRAWS) if (each := standardised(draws, rng, rounded)) is not None])
+    assert len(found) > 0.8 * DRAWS
+    rms = np.sqrt(np.mean(found**2, axis=0))
+    assert (rms > 0.4).all()
+    assert (rms < 1.4).all()
+    assert np.abs(found).max() < 4.5
 
 
 @pytest.mark.parametrize(("directions", "budget_db"), [("2d:91", -20.0), ("2d:181", -35.0), ("3d:600", -14.0)])

@@ -153,12 +153,14 @@ def test_process_accepts_threads_device_method_and_dtype(recording, tmp_path):
         "numpy": ["--device", "numpy"],
         "paper": ["--method", "paper"],
         "half": ["--dtype", "float16"],
+        "levels": ["--dtype", "uint8"],
     }.items():
         run("process", recording, "-o", tmp_path / f"{name}.h5", *FAST, *extra)
         with open_energyscapes(tmp_path / f"{name}.h5") as back:
             amplitudes[name] = back[0].amplitude
     assert np.array_equal(amplitudes["one"], amplitudes["two"])
     np.testing.assert_allclose(amplitudes["half"], amplitudes["one"], rtol=2**-10, atol=1e-7)
+    np.testing.assert_allclose(amplitudes["levels"], amplitudes["one"], rtol=0.03, atol=8e-7)
     np.testing.assert_allclose(amplitudes["numpy"], amplitudes["one"], atol=0.01 * amplitudes["one"].max())
     assert not np.array_equal(amplitudes["paper"], amplitudes["one"])
 

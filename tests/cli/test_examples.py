@@ -111,6 +111,19 @@ def test_safety_stop_holds_through_missing_echoes(safety_stop):
     assert way.speed == 0
 
 
+def test_safety_stop_waits_for_a_farther_echo_if_a_near_one_disappears(safety_stop):
+    way = safety_stop.Way()
+    for now_s, nearest_m in enumerate([5.0] * 6 + [0.6] + [np.inf] * 20):
+        way.see(nearest_m, now_s)
+    assert way.speed == 0
+    for now_s in range(30, 33):
+        way.see(3.0, now_s)
+    assert way.speed == 1
+    for now_s in range(40, 50):
+        way.see(np.inf, now_s)  # the obstacle was far when it disappeared
+    assert way.speed == 2
+
+
 def test_safety_stop_stops_without_images(safety_stop):
     way = safety_stop.Way()
     for number in range(6):

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+import ertis_numba as ertis
 from ertis_numba.campaign import Campaign
 from tests.campaigns import InlinePool
 from tests.pages import page
@@ -66,11 +67,22 @@ def test_commands_of_the_page_run_in_order(place):
 
 
 def test_code_of_the_page_runs(place, capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    code, _ = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     (place / "runs" / "torn.h5").unlink(missing_ok=True)
     with warnings.catch_warnings(action="error"):
         exec(compile(code, "many.md", "exec"), {"__name__": "__main__"})
     assert "runs/front.h5 made" in capsys.readouterr().out
+
+
+def test_code_for_object_storage_reads_a_recording(place):
+    """tests/storage/test_file_objects.py reads it by byte ranges from a server."""
+    _, code = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    with ertis.open_recording(place / "runs" / "front.h5") as recording:
+        sensor = recording.sensor
+    code = code.replace("https://server/platform.h5", "runs/front.h5").replace('"front"', repr(sensor))
+    found = {}
+    exec(compile(code.replace("[12]", "[0]"), "many.md", "exec"), found)
+    assert found["image"].amplitude.any()
 
 
 def test_page_has_its_table():

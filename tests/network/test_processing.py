@@ -152,9 +152,10 @@ def test_slots_are_used_again_and_are_limited():
     pool.close()
 
 
-def test_options_override_settings_of_a_sensor():
+@pytest.mark.parametrize("dtype", ["float16", "uint8"])
+def test_options_override_settings_of_a_sensor(dtype):
     with (
-        driven(processing={"directions": "2d:5"}, max_error_db=-30.0, dtype="float16") as loop,
+        driven(processing={"directions": "2d:5"}, max_error_db=-30.0, dtype=dtype) as loop,
         Application(loop.processing.address) as application,
     ):
         application.subscribe("energyscape")
@@ -167,9 +168,16 @@ def test_options_override_settings_of_a_sensor():
     applied = application.descriptions[image.description][1]
     assert (applied.processing.directions, applied.accuracy.max_error_db) == ("2d:5", -30.0)
     with Pipeline(applied, device="numpy") as pipeline:
-        wanted = pipeline.process(MEASUREMENT).amplitude.astype(np.float16)
-    assert image.dtype == "float16"
-    assert np.array_equal(np.frombuffer(amplitude, "<f2").reshape(image.shape), wanted)
+        wanted = pipeline.process(MEASUREMENT).amplitude
+    assert image.dtype == dtype
+    if dtype == "float16":
+        assert image.floor_db is image.step_db is None
+        assert np.array_equal(np.frombuffer(amplitude, "<f2").reshape(image.shape), wanted.astype(np.float16))
+    else:
+        code = np.frombuffer(amplitude, np.uint8).reshape(image.shape)
+        level_db = image.floor_db + (code - 1.0) * image.step_db
+        assert np.abs(level_db - 20 * np.log10(wanted))[code > 0].max() <= 0.251
+        assert (wanted[code == 0] < 10 ** ((image.floor_db - 0.249) / 20)).all()
 
 
 def test_overload_drops_the_oldest_and_counts_each():

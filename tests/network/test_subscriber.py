@@ -94,6 +94,21 @@ def test_half_precision_images_arrive_as_float32(publisher):
     np.testing.assert_array_equal(came.amplitude, half.amplitude.astype(np.float32))
 
 
+def test_levels_arrive_as_float32_with_their_step(publisher):
+    """Each image has its own scale."""
+    codes = image().replace(amplitude=np.resize(np.arange(256, dtype=np.uint8), image().amplitude.shape))
+    with Subscriber(publisher.address) as subscriber:
+        subscribed(publisher)
+        for floor_db, step_db in ((-122.0, 0.5), (-90.0, 0.25)):
+            publisher.publish(codes, floor_db=floor_db, step_db=step_db)
+            came = got(publisher, subscriber)
+            assert (came.amplitude.dtype, came.level_step_db) == (np.float32, step_db)
+            heard = codes.amplitude > 0
+            found_db = 20 * np.log10(came.amplitude[heard])
+            np.testing.assert_allclose(found_db, floor_db + step_db * (codes.amplitude[heard] - 1.0), atol=1e-4)
+            assert not came.amplitude[~heard].any()
+
+
 def test_raw_measurement_keeps_its_own_air(publisher):
     with Subscriber(publisher.address, products=["raw"]) as subscriber:
         subscribed(publisher)

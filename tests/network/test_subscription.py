@@ -36,6 +36,11 @@ from tests.publishing import (
 WAIT_S = 60.0
 
 
+def levels_of(given):
+    """An image of 8-bit codes, without their scale."""
+    return given.replace(amplitude=np.full(given.amplitude.shape, 9, np.uint8))
+
+
 @pytest.fixture
 def publisher():
     with Publisher() as made:
@@ -117,6 +122,8 @@ def _heard_s(subscriber):
         (lambda p: p.raw(messages.encode(messages.Ping())), "message is 'ping'"),
         (lambda p: p.publish(image(), shape=(31, 17)), r"image has shape \(31, 17\), but its axes"),
         (lambda p: p.publish(image(), dtype="float16"), "77500 bytes arrived for float16"),
+        (lambda p: p.publish(levels_of(image())), "an image has 8-bit levels from None dB in steps of None dB"),
+        (lambda p: p.publish(levels_of(image()), floor_db=0.0, step_db=-1.0), "from 0.0 dB in steps of -1.0 dB; state"),
         (lambda p: p.publish(image(), description=9), "refers to description 9, which has not arrived"),
         (lambda p: p.publish(cloud(), n_points=2**60), "16 bytes arrived for float32 of shape"),
         (lambda p: p.publish(measurement(), crc32=1), "does not match the CRC-32 in its header"),

@@ -1,4 +1,4 @@
-"""Contracts of the kernels of points, for one thread: the image of a single reflector, and interpolated maxima."""
+"""Contracts of the kernels of points, for one thread: images of reflectors, interpolated maxima, and 8-bit levels."""
 
 import math
 from dataclasses import dataclass
@@ -180,6 +180,18 @@ class NoiseAround(Protocol):
     ) -> None: ...
 
 
+class EncodeLevels(Protocol):
+    """Round levels to codes: ``out = 1 + (log2(amplitude) - floor) * per_octave``, at least 0 and at most 255.
+
+    ``bits`` (place,) int32 are those of the amplitudes in single precision. Zeros have the code 0; negative numbers,
+    infinity and NaN have 255.
+    """
+
+    def __call__(
+        self, bits: NDArray[np.int32], floor: np.float32, per_octave: np.float32, out: NDArray[np.uint8]
+    ) -> None: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointKernels:
     """Kernels of points of one device, all for one thread."""
@@ -189,3 +201,4 @@ class PointKernels:
     interpolate_tops: InterpolateTops
     fit_echoes: FitEchoes
     noise_around: NoiseAround
+    encode_levels: EncodeLevels

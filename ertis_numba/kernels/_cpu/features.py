@@ -39,7 +39,8 @@ class InstructionSet:
 
     ``multiply_pairs`` is LLVM's name of the instruction that multiplies 16-bit numbers and adds the products of each
     pair. If it is empty, each product has a sum of its own, and LLVM emits ``smlal`` for NEON. ``has_masks``: registers
-    of one bit per lane select lanes.
+    of one bit per lane select lanes. ``symbol_bits``: one instruction looks up numbers of 16 or 32 bits in tables of
+    ``2 ** symbol_bits``; 0 if none does.
     """
 
     name: str
@@ -47,15 +48,16 @@ class InstructionSet:
     sums: int
     multiply_pairs: str
     has_masks: bool = False
+    symbol_bits: int = 0
 
 
 _X86: Final[tuple[tuple[set[str], InstructionSet], ...]] = (
     (
         {"avx512bw", "avx512vnni"},
-        InstructionSet("AVX-512 VNNI", 16, 24, "llvm.x86.avx512.pmaddw.d.512", has_masks=True),
+        InstructionSet("AVX-512 VNNI", 16, 24, "llvm.x86.avx512.pmaddw.d.512", has_masks=True, symbol_bits=5),
     ),
-    ({"avx512bw"}, InstructionSet("AVX-512", 16, 24, "llvm.x86.avx512.pmaddw.d.512", has_masks=True)),
-    ({"avx2"}, InstructionSet("AVX2", 8, 12, "llvm.x86.avx2.pmadd.wd")),
+    ({"avx512bw"}, InstructionSet("AVX-512", 16, 24, "llvm.x86.avx512.pmaddw.d.512", has_masks=True, symbol_bits=5)),
+    ({"avx2"}, InstructionSet("AVX2", 8, 12, "llvm.x86.avx2.pmadd.wd", symbol_bits=3)),
     (set(), InstructionSet("SSE2", 4, 12, "llvm.x86.sse2.pmadd.wd")),
 )
 """Instruction sets of x86-64 with the features that they need, best first; every x86-64 has SSE2.

@@ -12,7 +12,7 @@ from numba.extending import intrinsic, models, overload, register_model
 
 from ertis_numba.kernels._cpu.features import target_features
 
-__all__ = ["LANES", "as_float64", "bits", "clamp", "load", "sign", "splat", "store", "turn_octet"]
+__all__ = ["LANES", "as_float64", "bits", "clamp", "load", "sign", "splat", "store", "transposed", "turn_octet"]
 
 LANES = 16 if "avx512f" in target_features() else 8
 """Microphones processed in parallel: two vectors of AVX-512 or of AVX, because one would stall at every step."""
@@ -180,7 +180,7 @@ def turn_octet(typing_context, signals, rows, octet, sample, tile, n):
             row = builder.load(builder.gep(rows.data, [builder.add(lane, whole(i))]))
             place = builder.add(builder.mul(row, length), values["sample"])
             octet.append(_load(builder, builder.bitcast(builder.gep(signals.data, [place]), vector)))
-        for j, turned in enumerate(_turned(builder, octet)):
+        for j, turned in enumerate(transposed(builder, octet)):
             row = builder.add(values["n"], whole(j))
             place = builder.add(builder.mul(row, whole(LANES)), lane)
             builder.store(turned, builder.bitcast(builder.gep(tile.data, [place]), vector)).align = 8
@@ -189,18 +189,21 @@ def turn_octet(typing_context, signals, rows, octet, sample, tile, n):
     return signature, codegen
 
 
-def _turned(builder, octet):
-    """Return 8 vectors of 8, transposed."""
-    for step in (1, 2, 4):
-        even = [k ^ step | 8 if k & step else k for k in range(8)]  # indices of 8 and above select the second vector
-        odd = [k | 8 if k & step else k ^ step for k in range(8)]
-        octet = [
+def transposed(builder, rows):
+    """Return n vectors of n numbers, transposed; n is a power of 2."""
+    n, index = len(rows), ir.IntType(32)
+    step = 1
+    while step < n:
+        even = [k ^ step | n if k & step else k for k in range(n)]  # indices of n and above select the second vector
+        odd = [k | n if k & step else k ^ step for k in range(n)]
+        rows = [
             builder.shuffle_vector(
-                octet[i & ~step], octet[i | step], ir.Constant(ir.VectorType(_INT32, 8), odd if i & step else even)
+                rows[i & ~step], rows[i | step], ir.Constant(ir.VectorType(index, n), odd if i & step else even)
             )
-            for i in range(8)
+            for i in range(n)
         ]
-    return octet
+        step *= 2
+    return rows
 
 
 def _load(builder, pointer):

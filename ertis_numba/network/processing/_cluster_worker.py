@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.frames.level_codes import LevelCodes, as_dtype
 from ertis_numba.network.processing.shared_slots import POINTS_BYTES
 from ertis_numba.processes.cluster import current_worker
 
@@ -31,10 +32,11 @@ _chains: "OrderedDict[tuple[str, str, str], SharedPipeline]" = OrderedDict()
 class ClusterResult:
     """Result of processing a measurement."""
 
-    image: NDArray[Any]  # (direction, range) float32 or float16
+    image: NDArray[Any]  # (direction, range), of the dtype
     points: NDArray[np.float32]  # (point, 4), empty unless requested
     took_s: float
     worker: str  # address
+    levels: LevelCodes | None = None  # of uint8
 
 
 def prepare(kind: int, settings: str, device: str, plan: "PlanCosts" = "nominal") -> "Prepared | str":
@@ -65,8 +67,8 @@ def process(
     except DataError as error:
         return str(error)
     found = chain.points(image, POINTS_BYTES // 16) if points else np.empty((0, 4), _WORDS)
-    amplitude = image.amplitude if dtype == "float32" else image.amplitude.astype(np.float16)
-    return ClusterResult(amplitude, found, time.perf_counter() - begun_s, _address())
+    amplitude, levels = as_dtype(image.amplitude, dtype)
+    return ClusterResult(amplitude, found, time.perf_counter() - begun_s, _address(), levels)
 
 
 def _chain(settings: str, device: str, plan: "PlanCosts") -> "SharedPipeline":

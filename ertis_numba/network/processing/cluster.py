@@ -283,7 +283,7 @@ class Cluster:
         self._attempts.remove(attempt)
         member.busy -= 1
         if isinstance(result, there.ClusterResult):
-            job.slot, job.n_points = slot, len(result.points)
+            job.slot, job.n_points, job.levels = slot, len(result.points), result.levels
             member.done += 1
             return FinishedJob(job, result.took_s)
         self._slots.release(slot)

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ertis_numba.base import checks
+from ertis_numba.base.constants import IMAGE_DTYPES, ImageDtype
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.chain.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.geometry import direction_grid
@@ -30,14 +31,14 @@ class ProcessingOptions:
     threads: int | None = None  # of all workers together; all cores by default
     deadline_s: float = 2.0  # after that, the worker of a measurement is killed
     prepare_s: float = 300.0  # includes the compilation of kernels for a sensor
-    dtype: Literal["float32", "float16"] = "float32"  # of published images
+    dtype: ImageDtype = "float32"  # of published images
     quarantine: Path | None = None  # dead-letter folder, for measurements that made two workers fail
     expected: Settings | None = None  # of a likely sensor, to prepare for in advance
 
     def __post_init__(self) -> None:
         checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
-        checks.choice("dtype", self.dtype, ("float32", "float16"))
+        checks.choice("dtype", self.dtype, IMAGE_DTYPES)
         checks.positive("deadline", self.deadline_s)
         checks.positive("prepare_s", self.prepare_s)
         for name in ("workers", "threads"):

@@ -4,6 +4,8 @@ from typing import Literal
 
 import msgspec
 
+from ertis_numba.base.constants import ImageDtype
+from ertis_numba.frames.level_codes import LevelCodes
 from ertis_numba.network.messages import Data, Description, Group
 from ertis_numba.network.status import SubscriberStatus
 
@@ -124,6 +126,7 @@ class JobFinished(_Note, frozen=True, kw_only=True):
     job: int
     took_s: float
     n_points: int
+    levels: LevelCodes | None = None
 
 
 class JobFailed(_Note, frozen=True, kw_only=True):
@@ -180,7 +183,8 @@ class Publish(_Note, frozen=True, kw_only=True):
     description: int | None  # None without an image
     raw_description: int
     shape: tuple[int, int]
-    dtype: Literal["float32", "float16"]
+    dtype: ImageDtype
+    levels: LevelCodes | None
     n_points: int
     words_bytes: int
 

@@ -367,6 +367,7 @@ class ImageProcessing:
             raw_description=sensor.raw,
             shape=self._sensors.shape_of(job.kind) if is_image else (0, 0),
             dtype=self._options.dtype,
+            levels=job.levels,
             n_points=job.n_points if job.points else -1,
             words_bytes=job.words.nbytes,
         )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 import zmq
 
 from ertis_numba.base.errors import DataError, ErtisError, FormatVersionError
@@ -167,8 +168,9 @@ class _Publisher:
         items = []
         if about is not None and self._subscribers.wanted("energyscape", sensor):
             rows, columns = note.shape
-            payloads = _pieces(view.image(rows * columns * (4 if note.dtype == "float32" else 2)))
-            image = Image(description=about[0], shape=note.shape, dtype=note.dtype, **common, **times)
+            payloads = _pieces(view.image(rows * columns * np.dtype(note.dtype).itemsize))
+            levels = {} if note.levels is None else note.levels._asdict()
+            image = Image(description=about[0], shape=note.shape, dtype=note.dtype, **levels, **common, **times)
             items.append(QueuedProduct("energyscape", sensor, image, payloads, about))
         if about is not None and note.n_points >= 0 and self._subscribers.wanted("points", sensor):
             cloud = Points(description=about[0], n_points=note.n_points, **common, **times)

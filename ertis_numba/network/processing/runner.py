@@ -7,6 +7,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.frames.level_codes import LevelCodes
 from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.parallelism import Load
 from ertis_numba.network.processing.pipe_messages import Prepared
@@ -38,6 +39,7 @@ class Job:
     tries: int = 0  # failed ones
     slot: Slot | None = None  # has samples and image once finished; release it afterwards
     n_points: int = 0
+    levels: LevelCodes | None = None  # of an image of 8-bit levels
     predict: bool = False  # warn if images may exceed the error budget
     check_sound: bool = False  # warn if the sound contradicts the settings
 

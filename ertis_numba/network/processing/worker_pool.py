@@ -273,7 +273,7 @@ class LocalWorkerPool:
         worker.succeeded()
         if worker.mode is not None:
             self._chosen.took(worker.mode, note.took_s)
-        job.slot, job.n_points = slot, note.n_points
+        job.slot, job.n_points, job.levels = slot, note.n_points, note.levels
         return [FinishedJob(job, note.took_s)]
 
     def _next_kind(self, worker: Worker) -> None:

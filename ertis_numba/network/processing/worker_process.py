@@ -11,6 +11,7 @@ import numpy as np
 
 from ertis_numba.base.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.level_codes import LevelCodes, as_dtype
 from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.network.processing.pipe_messages import (
     FromWorker,
@@ -96,17 +97,17 @@ class _ImageWorker:
         begun_s = time.perf_counter()
         end_after(_NEGLECTED * self._given.deadline_s)
         try:
-            n_points = self._made(self._chains[order.kind], self._views[order.slot], order)
+            n_points, levels = self._made(self._chains[order.kind], self._views[order.slot], order)
         except DataError as error:
             return JobFailed(job=order.job, text=str(error), again=False)
         except Exception as error:  # noqa: BLE001  a mistake in one measurement's way must not end the others'
             return JobFailed(job=order.job, text=f"{type(error).__name__}: {error}", again=True)
         finally:
             end_after(0)
-        return JobFinished(job=order.job, took_s=time.perf_counter() - begun_s, n_points=n_points)
+        return JobFinished(job=order.job, took_s=time.perf_counter() - begun_s, n_points=n_points, levels=levels)
 
-    def _made(self, chain: "SharedPipeline", view: SlotView, order: ProcessJob) -> int:
-        """Make the image in its slot, and the points; return the number of points."""
+    def _made(self, chain: "SharedPipeline", view: SlotView, order: ProcessJob) -> tuple[int, LevelCodes | None]:
+        """Make the image in its slot, and the points; return the number of points, and the scale of 8-bit levels."""
         place = view.image_as(chain.shape, self._given.dtype)
         words = view.words(order.words_bytes)
         image = chain.image(words, place if self._given.dtype == "float32" else None, threads=order.threads)
@@ -117,13 +118,15 @@ class _ImageWorker:
             elif order.predict:
                 whole = image.replace(amplitude=image.amplitude.copy())
             self._predictions.add(order.sensor, whole, measurement)
+        levels = None
         if self._given.dtype != "float32":
-            np.copyto(place, image.amplitude, casting="same_kind")
+            stored, levels = as_dtype(image.amplitude, self._given.dtype)
+            np.copyto(place, stored)
         if not order.points:
-            return 0
+            return 0, levels
         points = chain.points(image, POINTS_BYTES // 16)
         view.points(points.nbytes)[:] = points.tobytes()
-        return len(points)
+        return len(points), levels
 
 
 def end_after(time_s: float) -> None:
