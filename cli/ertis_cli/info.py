@@ -275,14 +275,16 @@ def _placement(reader: "_Reader") -> dict[str, Any]:
 
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
-    """Return the predicted error and the error budget, if the file contains them."""
+    """Return the step of rounded levels, and the predicted error and the error budget, if the file contains them."""
+    rounded = {"level_step_db": reader.level_step_db} if reader.level_step_db else {}
     if reader.predicted_error_db is None:
-        return {}
+        return rounded
     texts = {name: getattr(reader, name) for name in ("budget_applies_to", "error_warning")}
     return {
         "predicted_error_db": reader.predicted_error_db,
         "max_error_db": reader.max_error_db,
         **{name: text for name, text in texts.items() if text},
+        **rounded,
     }
 
 

@@ -23,6 +23,7 @@ from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.chain.planner import Planner
 from ertis_numba.chain.wavefronts import plane_wave_error_db
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.level_codes import ROUNDING_DB
 from ertis_numba.geometry import observable_angles
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
@@ -271,6 +272,12 @@ def _check_sensor(
             if not options.verify:
                 remedy = f"measure the error (verify=True), or {remedy}"
             warn(f"{place}: {run.prediction.warning}{f'; {remedy}' if run.prediction.has_echoes else ''}")
+    budget_db = run.pipeline.settings.accuracy.max_error_db
+    if options.dtype == "uint8" and budget_db < ROUNDING_DB:
+        warn(
+            f"{place}: uint8 rounds levels with an error of {ROUNDING_DB:.1f} dB, but accuracy.max_error_db is "
+            f"{budget_db:g} dB; use dtype float16 or float32"
+        )
     if not (options.explain or options.verify):
         return
     from ertis_numba.campaign.examination import examine  # noqa: PLC0415  slow to import and rarely used

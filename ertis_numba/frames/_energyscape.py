@@ -265,6 +265,7 @@ class Energyscape(DegreesFromRadians):
             about="envelope amplitude; 1 is a full-scale echo in every microphone",
             settings=self.settings,
             stamp=self.stamp,
+            **({"level_step_db": self.level_step_db} if self.level_step_db else {}),
         )
 
 

@@ -25,6 +25,7 @@ def data_array(
     about: str,
     settings: Settings,
     stamp: Stamp,
+    **further: float,
 ) -> "xarray.DataArray":
     """Return a labelled array that shares memory with values; coords: (dimension, values, description, unit)."""
     # The settings become an attribute as TOML, and the time a scalar coordinate for `xarray.concat`.
@@ -44,5 +45,6 @@ def data_array(
         "timestamp_uncertainty_ns": stamp.timestamp_uncertainty_ns,
         "behaviour": stamp.behaviour,
         "settings": settings.to_toml(),
+        **further,
     }
     return xr.DataArray(values, coords=labels, dims=dims, name=name, attrs=attributes)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.base.errors import ArgumentError, DataError
 
-__all__ = ["LevelCodes", "as_dtype", "rounding_np"]
+__all__ = ["ROUNDING_DB", "LevelCodes", "as_dtype", "rounding_np"]
 
 _STEP_DB: Final = 0.5
 _LAST: Final = 255
@@ -99,3 +99,7 @@ def as_dtype(amplitude: NDArray[np.float32], dtype: str) -> tuple[NDArray[Any], 
 def rounding_np(step_db: float) -> float:
     """Return the standard deviation of levels that are rounded to a step, in nepers."""
     return step_db * math.log(10) / 20 / math.sqrt(12)
+
+
+ROUNDING_DB: Final = 20 * math.log10(rounding_np(_STEP_DB))
+"""Error of images by the rounding of their levels, relative to the images."""

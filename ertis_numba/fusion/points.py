@@ -112,13 +112,15 @@ class PointFuser:
         """Return the echoes of an image above its noise, strongest first; ``late_m`` is as in `pair_of`."""
         heard = self.heard(image).echoes
         emitters = [emitter for emitter, number in shares if number == self._number]
+        # Rounded levels shift the echoes of all calls from a direction alike, so that their mean is not better.
+        alike = math.sqrt(len(emitters)) if image.level_step_db else 1.0
         return SensorEchoes(
             receiver=self._number,
             emitters=np.array(emitters, dtype=np.int64),
             direction=heard.direction,
             path_m=2 * heard.range_m[:, None] - np.array([late_m[emitter] for emitter in emitters]),
-            path_sd_m=heard.path_sd_m,
-            angle_sd_rad=heard.angle_sd_rad,
+            path_sd_m=alike * heard.path_sd_m,
+            angle_sd_rad=alike * heard.angle_sd_rad,
             power=heard.power,
             share=self._shares(heard.row, heard.range_m, [shares[emitter, self._number] for emitter in emitters]),
             is_clear=heard.is_clear,

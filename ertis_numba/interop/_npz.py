@@ -43,6 +43,8 @@ def write_npz(path: Path, results: Iterable[Result], count: int | None) -> None:
             arrays |= {axis: np.full_like(arrays[axis], np.nan) for axis in _ANGLES if axis in axes}
         arrays |= {field: np.array([getattr(stamp, field) for stamp in stamps], dtype=np.int64) for field in _STAMPS}
         arrays["behaviour"] = np.array([stamp.behaviour for stamp in stamps])
+        if isinstance(first, Energyscape) and first.level_step_db:
+            arrays["level_step_db"] = np.array(first.level_step_db)
         arrays["sensor"] = np.array(first.stamp.sensor)
         arrays["settings"] = np.array(self_contained(first.settings).to_toml())
         for field, array in arrays.items():

@@ -165,6 +165,18 @@ def test_process_accepts_threads_device_method_and_dtype(recording, tmp_path):
     assert not np.array_equal(amplitudes["paper"], amplitudes["one"])
 
 
+def test_rounding_beyond_the_budget_is_reported(recording, tmp_path):
+    path = tmp_path / "img.h5"
+    done = run("process", recording, "-o", path, *FAST, "--dtype", "uint8", "--max-error", -60)
+    assert "uint8 rounds levels with an error of -35.6 dB, but accuracy.max_error_db is -60 dB; use" in done.stderr
+    assert "uint8" not in run("process", recording, "-o", path, *FAST, "--dtype", "uint8", "--force").stderr
+    (found,) = report("info", path)["sensors"]
+    assert found["level_step_db"] == 0.5
+    run("export", path, "-o", tmp_path / "img.npz")
+    with np.load(tmp_path / "img.npz") as arrays:
+        assert arrays["level_step_db"] == 0.5
+
+
 def test_process_limits_azimuth_of_a_grid(recording, tmp_path):
     run("process", recording, "-o", tmp_path / "img.h5", "--directions", "2d:3", "--azimuth", "-40:20", *FAST[:2])
     with open_energyscapes(tmp_path / "img.h5") as back:

@@ -51,6 +51,11 @@ def test_energyscapes_have_the_names_and_values_of_their_files(tmp_path):
     assert {*joined.coords, joined.name} <= about
 
 
+def test_arrays_of_rounded_levels_state_the_step():
+    assert "level_step_db" not in image().to_xarray().attrs
+    assert image().replace(level_step_db=0.5).to_xarray().attrs["level_step_db"] == 0.5
+
+
 def test_energyscapes_share_memory_with_xarray_and_select_by_label():
     given = image()
     data = given.to_xarray()
