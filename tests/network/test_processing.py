@@ -392,4 +392,4 @@ def test_checks_have_a_lower_priority_than_images(monkeypatch):
     predictions.add("sensor", None, MEASUREMENT)
     while predictions.busy:
         predictions.drain()
-    assert found == [19] != [os.getpriority(os.PRIO_PROCESS, threading.get_native_id())]
+    assert found == [10] != [os.getpriority(os.PRIO_PROCESS, threading.get_native_id())]
