@@ -126,12 +126,12 @@ class JournalSensor:
         numbered = (sensor_id, *values)
         return (*numbered, row_crc32(numbered), words)
 
-    def entry_values(self, entry: JournalEntry) -> tuple[Any, ...]:
-        """Return the values of a measurement and its data, and fill in its CRC-32."""
+    def entry_values(self, entry: JournalEntry, *, fill: bool = True) -> tuple[Any, ...]:
+        """Return the values of a measurement and its data, and ``fill`` in its CRC-32."""
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
         words = self._sample_data(entry.measurement.data)
         checks.choice("behaviour", stamp.behaviour, BEHAVIOURS)
-        if entry.crc32 is None:
+        if entry.crc32 is None and fill:
             entry.crc32 = zlib.crc32(words.data)
         return (
             checks.integer("session_id", stamp.session_id, 0, _INT64[1]),
@@ -144,7 +144,7 @@ class JournalSensor:
             float(air.humidity_percent),
             float(air.pressure_pa),
             stamp.behaviour,
-            checks.integer("crc32", entry.crc32, 0, 2**32 - 1),
+            None if entry.crc32 is None else checks.integer("crc32", entry.crc32, 0, 2**32 - 1),
             words,
         )
 

@@ -1,6 +1,7 @@
 """Sensor node over real sockets: each measurement arrives once and unchanged, or becomes a gap with a reason."""
 
 import random
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +43,17 @@ def test_measurements_arrive_with_stamp_air_and_settings():
         49,
         "stored",
     )
+
+
+@pytest.mark.parametrize("with_spool", [False, True])
+def test_append_fills_in_the_crc32_of_all_measurements(tmp_path, with_spool):
+    given = [replace(entry, crc32=None) for entry in entries(20, first=0)]
+    with StandIn() as central, Node(central.address, spool=tmp_path if with_spool else None) as node:
+        kept = node.append(given)
+        assert [entry.crc32 for entry in kept] == [zlib.crc32(entry.measurement.data) for entry in given]
+        assert node.flush(SOON_S)
+    assert central.wrong == []
+    assert [message.crc32 for message, _ in central.held[KEY].values()] == [entry.crc32 for entry in kept]
 
 
 def test_gaps_arrive_in_order():

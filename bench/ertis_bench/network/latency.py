@@ -19,8 +19,8 @@ from ertis_numba.network.trace import VARIABLE
 __all__ = ["FORMS", "STAGES", "latency", "run"]
 
 STAGES: Final = {
-    "kept": ("sensor node", "CRC-32 and spool"),
-    "sent": ("sensor node", "link thread: header, frames to ZeroMQ"),
+    "kept": ("sensor node", "spool"),
+    "sent": ("sensor node", "CRC-32; link thread: header, frames to ZeroMQ"),
     "arrived": ("sensor node → central node", "CURVE, TCP, CURVE"),
     "checked": ("central node", "header, key, CRC-32"),
     "submitted": ("central node", "queue, copy into shared memory, order by pipe"),

@@ -73,7 +73,7 @@ class Spool:
             self.counts.setdefault(sensor.name, SensorCounts())
 
     def append(self, entries: Sequence[JournalEntry]) -> list[JournalEntry]:
-        """Keep measurements, and return the kept ones; their CRC-32 is filled in if it is None."""
+        """Keep measurements, and return the kept ones, whose CRC-32 may still be None."""
         with self.turn:
             self.check(entries)
             for entry in entries:
@@ -94,7 +94,7 @@ class Spool:
                 self._accepted[sensor.name] = settings
             # The encoder requires contiguous little-endian data and Python integers.
             session_id, number, sync_count, time_ns, uncertainty_ns, *rest, behaviour, crc32, words = (
-                sensor.entry_values(entry)
+                sensor.entry_values(entry, fill=False)
             )
             checks.integer("sequence", number, 0, MAX_SEQUENCE)
             stamp = Stamp(

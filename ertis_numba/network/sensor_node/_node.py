@@ -17,7 +17,7 @@ from ertis_numba.network.sensor_node._disk_spool import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
 from ertis_numba.network.sensor_node._memory_spool import SensorCounts, Spool
 from ertis_numba.network.sensor_node._settings_requests import SettingsRequest
-from ertis_numba.network.sensor_node._wire import Acknowledged
+from ertis_numba.network.sensor_node._wire import Acknowledged, crc32_of
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
 
@@ -184,7 +184,11 @@ class SensorNode:
         kept = self._spool.append(entries)
         for entry in kept:
             mark("kept", entry.measurement.stamp.sensor, entry.measurement.stamp.sequence)
-        self._wake()
+        for entry in kept[:1]:
+            crc32_of(entry)
+        self._wake()  # The first is sent while the CRC-32 of the others is computed.
+        for entry in kept[1:]:
+            crc32_of(entry)
         return kept
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:

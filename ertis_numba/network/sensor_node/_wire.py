@@ -11,7 +11,7 @@ from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession, 
 if TYPE_CHECKING:
     from ertis_numba.network.message_fields import Position, Quaternion
 
-__all__ = ["Acknowledged", "Frames", "frames_of", "greeting"]
+__all__ = ["Acknowledged", "Frames", "crc32_of", "frames_of", "greeting"]
 
 Frames: TypeAlias = "list[bytes | memoryview]"
 
@@ -44,6 +44,13 @@ def greeting(run: OutgoingSession) -> Frames:
     return [messages.encode(hello), settings]
 
 
+def crc32_of(entry: JournalEntry) -> int:
+    """Return the CRC-32 of a kept measurement, filled in if it is None; two threads may do that at once."""
+    if entry.crc32 is None:
+        entry.crc32 = zlib.crc32(entry.measurement.data.data)
+    return entry.crc32
+
+
 def frames_of(run: OutgoingSession, item: UnackedItem, entry: JournalEntry | None) -> tuple[Frames, int]:
     """Return the frames of an item, and its last number at that time."""
     if entry is None:
@@ -64,7 +71,7 @@ def frames_of(run: OutgoingSession, item: UnackedItem, entry: JournalEntry | Non
         temperature_c=float(air.temperature_c),
         humidity_percent=float(air.humidity_percent),
         pressure_pa=float(air.pressure_pa),
-        crc32=entry.crc32 or 0,
+        crc32=crc32_of(entry),
         behaviour=stamp.behaviour,
     )
     return [messages.encode(data), entry.measurement.data.data.cast("B")], stamp.sequence
