@@ -67,7 +67,7 @@ def signal_model_of(
             image = chain.new_image()
             chain.process(words, image)
         else:
-            image = np.ldexp(amplitude, -exponent)
+            image = np.ldexp(amplitude, -exponent) if exponent else amplitude
     finally:
         chain.close()
     analytic = heard[:, :, lead:]
@@ -77,7 +77,7 @@ def signal_model_of(
     undivided = float(np.mean(np.abs(series) ** 2)) or 1e-30  # Power before calibration, like that of the tiles.
     series = (series / gain * array_weights(settings)[:, None]).astype(np.complex64)
     power = float(np.mean(np.abs(series) ** 2)) or 1e-30
-    image_power = float(np.mean(np.square(image, dtype=np.float64)))
+    image_power = float(np.einsum("dr,dr->d", image, image, dtype=np.float64).sum()) / image.size  # without a copy
     # A tile extends beyond its ranges by the largest delay.
     starts = range(0, len(chain.range_m), _TILE)
     largest = [np.max(np.abs(heard[:, :, start : start + _TILE + 2 * lead])) ** 2 for start in starts]
@@ -110,7 +110,9 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
     # Without a taper, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
     edge = np.arange(series.shape[1]) / max(1, series.shape[1] - 1)
     taper = np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, 1 - edge) / _TAPERED)) ** 2
-    found = np.sum(np.abs(fourier.fft(series * taper)) ** 2, axis=0)
+    found = np.zeros(series.shape[1])
+    for signal in series:  # One by one, because transforms of all microphones need much memory.
+        found += np.abs(fourier.fft(signal * taper)) ** 2
     centres_hz, nominal = matched_noise_spectrum(settings, n_waves=WAVES)
     # Sampling at this rate has shifted the band by a multiple of the rate.
     bins = np.rint(centres_hz / rate_hz * len(found)).astype(int)
@@ -130,17 +132,26 @@ def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: floa
     half = length // 2
     padded = np.pad(series[mics], ((0, 0), (half, length + half)))
     tiles = np.lib.stride_tricks.sliding_window_view(padded, length, axis=1)[:, :: max(1, half)]
-    # Without a window, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
-    spectra = fourier.fft(tiles * np.hanning(length))
     # Sampling has shifted the band by multiples of the rate. Each bin represents its alias within the band.
     bins_hz = np.arange(length) * rate_hz / length
     frequency_hz = bins_hz + rate_hz * np.rint(((centres_hz[0] + centres_hz[-1]) / 2 - bins_hz) / rate_hz)
-    late_s = layout.delay_s[layout.enabled][mics, None, None]
-    spectra = spectra * np.exp(2j * np.pi * late_s * frequency_hz)
-    nearest = np.argmin(np.abs(frequency_hz[:, None] - centres_hz), axis=1)
     inside = (frequency_hz > centres_hz[0]) & (frequency_hz < centres_hz[-1])
-    found = [spectra[:, :, (nearest == wave) & inside] for wave in range(len(centres_hz))]
-    return np.stack([np.einsum("mtb,ntb->tmn", part, np.conj(part)) for part in found], axis=1)
+    frequency_hz = frequency_hz[inside]
+    late_s = layout.delay_s[layout.enabled][mics]
+    # Without a window, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
+    window = np.hanning(length)
+    spectra = np.stack(
+        [
+            fourier.fft(tile * window)[:, inside] * np.exp(2j * np.pi * late * frequency_hz)
+            for tile, late in zip(tiles, late_s, strict=True)
+        ]
+    )
+    nearest = np.argmin(np.abs(frequency_hz[:, None] - centres_hz), axis=1)
+    found = np.empty((spectra.shape[1], len(centres_hz), len(mics), len(mics)), np.complex128)
+    for wave in range(len(centres_hz)):
+        part = spectra[:, :, nearest == wave]
+        np.einsum("mtb,ntb->tmn", part, np.conj(part), out=found[:, wave])
+    return found
 
 
 def _white_power(settings: Settings) -> float:

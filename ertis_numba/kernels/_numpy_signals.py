@@ -21,11 +21,14 @@ __all__ = [
 
 Number = TypeVar("Number", np.float32, np.float64)
 
+_MICS = 4  # microphones demodulated at a time, because their undecimated signals need much memory
+
 
 def unpack_bits(words: Words, channels: Index, out: Real) -> None:
     """Convert the bits of PDM words to signals of +1 and −1."""
     octets = words.view(np.uint8).reshape(len(words), words.shape[1] * words.itemsize)
-    out[:] = np.unpackbits(octets, axis=1, bitorder="little")[:, channels].T
+    for signal, channel in zip(out, channels, strict=True):
+        signal[:] = octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1)
     out *= np.float32(2)
     out -= np.float32(1)
 
@@ -66,14 +69,16 @@ def demodulate_words(
     half = len(taps) // 2
     start = max(first * factor - half, 0)
     stop = min((first + n_outputs - 1) * factor + half + 1, len(words))
-    signals = np.empty((len(channels), max(stop - start, 0)), dtype=np.float32)
-    unpack_bits(words[start : start + signals.shape[1]], channels, signals)
-    # Sums of integers below 2^24 are exact in float32 in any order; 32-bit taps need float64.
     begin = first * factor - half - start
-    if taps.dtype == np.int16:
-        out[:, :n_outputs] = _filtered(signals, taps.astype(np.float32), factor, begin, n_outputs)
-    else:
-        out[:, :n_outputs] = _filtered(signals.astype(np.float64), taps.astype(np.float64), factor, begin, n_outputs)
+    # Sums of integers below 2^24 are exact in float32 in any order; 32-bit taps need float64.
+    exact = taps.astype(np.float32 if taps.dtype == np.int16 else np.float64)
+    for mic in range(0, len(channels), _MICS):
+        few = channels[mic : mic + _MICS]
+        signals = np.empty((len(few), max(stop - start, 0)), dtype=np.float32)
+        unpack_bits(words[start : start + signals.shape[1]], few, signals)
+        out[mic : mic + _MICS, :n_outputs] = _filtered(
+            signals.astype(exact.dtype, copy=False), exact, factor, begin, n_outputs
+        )
     out *= scale
     out[:, n_outputs:] = 0
 

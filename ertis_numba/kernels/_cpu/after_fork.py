@@ -12,13 +12,18 @@ from typing import Any, Final
 
 import llvmlite.binding
 from llvmlite import ir
+from numba import types
+from numba.core.ccallback import CFunc
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.registry import cpu_target
+from numba.extending import intrinsic
 from numba.np.ufunc import parallel
+
+from ertis_numba.kernels._cpu.loading import load_without_compiler
 
 __all__ = ["run_kernels_after_forks"]
 
 _SYMBOL: Final = "numba_parallel_for"  # Numba links compiled code to it.
+_FLAG, _LAYER = "ertis_is_forked", "ertis_parallel_for"
 _is_forked = ctypes.c_int32(0)  # 1 in a process that inherited threads which do not exist in it.
 
 
@@ -51,22 +56,38 @@ def _has_threads() -> bool:
     return bool(parallel._is_initialized)  # noqa: SLF001  Numba has no public function that starts no threads
 
 
-@global_compiler_lock  # type: ignore[untyped-decorator]  # Numba has no type hints
 def _compiled(parallel_for: int) -> int:
     """Return the address of a function that calls kernels directly in a forked process, otherwise with OpenMP."""
-    flag, word, address = ir.IntType(32), ir.IntType(64), ir.IntType(8).as_pointer()
-    kernel_type = ir.FunctionType(ir.VoidType(), [address] * 4)  # arguments, dimensions, steps, data
-    layer_type = ir.FunctionType(ir.VoidType(), [address] * 5 + [word] * 2 + [flag])
-    library: Any = cpu_target.target_context.codegen().create_library(__name__)
-    module = library.create_ir_module(__name__)
-    function = ir.Function(module, layer_type, f"{__name__}.{_SYMBOL}")
-    build = ir.IRBuilder(function.append_basic_block())
-    is_forked = build.load(build.inttoptr(word(ctypes.addressof(_is_forked)), flag.as_pointer()))
-    with build.if_then(build.icmp_signed("!=", is_forked, flag(0))):
-        build.call(build.bitcast(function.args[0], kernel_type.as_pointer()), function.args[1:5])
-        build.ret_void()
-    build.call(build.inttoptr(word(parallel_for), layer_type.as_pointer()), function.args)
-    build.ret_void()
-    library.add_ir_module(module)
-    library.finalize()
-    return int(library.get_pointer_to_function(function.name))
+    # It comes from Numba's cache, because a compilation takes 15 ms and 30 MB. Its addresses are symbols, therefore.
+    llvmlite.binding.add_symbol(_FLAG, ctypes.addressof(_is_forked))
+    llvmlite.binding.add_symbol(_LAYER, parallel_for)
+    signature = types.void(*[types.voidptr] * 5, types.intp, types.intp, types.int32)
+    function = CFunc(_parallel_for, (signature.args, signature.return_type), {}, {})
+    function.enable_caching()
+    load_without_compiler([function])
+    function.compile()
+    address: Any = function.address
+    return int(address)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _call(
+    _typing: Any, kernel: Any, parts: Any, sizes: Any, steps: Any, data: Any, n: Any, m: Any, threads: Any
+) -> Any:
+    def build(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        flag, address = ir.IntType(32), values[0].type
+        kernel_type = ir.FunctionType(ir.VoidType(), [address] * 4)  # arguments, dimensions, steps, data
+        layer_type = ir.FunctionType(ir.VoidType(), [each.type for each in values])
+        is_forked = builder.load(ir.GlobalVariable(builder.module, flag, _FLAG))
+        with builder.if_else(builder.icmp_signed("!=", is_forked, flag(0))) as (forked, usual):
+            with forked:
+                builder.call(builder.bitcast(values[0], kernel_type.as_pointer()), values[1:5])
+            with usual:
+                builder.call(ir.Function(builder.module, layer_type, _LAYER), values)
+        return context.get_dummy_value()
+
+    return types.void(kernel, parts, sizes, steps, data, n, m, threads), build
+
+
+def _parallel_for(kernel: Any, parts: Any, sizes: Any, steps: Any, data: Any, n: Any, m: Any, threads: Any) -> None:
+    _call(kernel, parts, sizes, steps, data, n, m, threads)

@@ -9,9 +9,10 @@ import logging
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
+from llvmlite import binding
 from numba.core import entrypoints
 from numba.core.caching import FunctionCache
-from numba.core.runtime import rtsys
+from numba.core.runtime import _nrt_python
 
 __all__ = ["load_without_compiler"]
 
@@ -51,6 +52,13 @@ def _nothing() -> None:
     pass
 
 
+@functools.cache
+def _register_runtime() -> None:
+    """Register the functions that stored code calls. Numba's own function also compiles some: 20 ms and 20 MB."""
+    for name, address in _nrt_python.c_helpers.items():
+        binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
 def _load(cache: Any, signature: Any, context: Any) -> Any:
     """Return the compiled code for a signature, or None if there is none, like `FunctionCache.load_overload`."""
     found = _stored(cache, signature, context)
@@ -61,7 +69,7 @@ def _load(cache: Any, signature: Any, context: Any) -> Any:
 
 def _stored(cache: Any, signature: Any, context: Any) -> Any:
     # Numba reads all types before it compares the age of the source; a cache with a renamed type is emptied.
-    rtsys.initialize(context)  # registers the functions that compiled code calls
+    _register_runtime()
     try:
         with cache._guard_against_spurious_io_errors():  # noqa: SLF001 - Numba has no public function for this
             return cache._load_overload(signature, context)  # noqa: SLF001
