@@ -107,6 +107,20 @@ def test_cluster_images_equal_those_of_a_local_pipeline(cluster, measurement):
     assert "2 workers" in cluster.choice
 
 
+def test_cluster_rounds_images_to_levels(scheduler, measurement):
+    runner = Cluster(ProcessingOptions(workers=scheduler, deadline_s=LONG_S, dtype="uint8"), lambda _: None)
+    kind = kind_of(measurement)
+    runner.prepare(kind)
+    events_of(runner)
+    runner.submit(job_of(measurement, 0, kind))
+    (done,) = events_of(runner)
+    with ertis.Pipeline(measurement.settings) as pipeline:
+        wanted = pipeline.process(measurement).amplitude
+    codes = done.job.slot.view.image_as(wanted.shape, np.uint8)
+    assert np.array_equal(codes, done.job.levels.encode(wanted))
+    runner.close()
+
+
 def test_cluster_accepts_one_job_per_thread(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
