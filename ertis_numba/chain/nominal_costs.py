@@ -12,8 +12,8 @@ __all__ = ["NOMINAL_COSTS"]
 NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
     "cpu AVX-512": {
         "call": 1.12e-06,
-        "demodulate_16": 7.34e-10,
-        "demodulate_32": 1.03e-09,
+        "demodulate_16": 3.3e-10,
+        "demodulate_32": 5.3e-10,
         "forward": 1.2e-10,
         "fold": 3.97e-10,
         "inverse": 2.41e-10,
@@ -32,8 +32,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
     },
     "cpu AVX-512 VNNI": {
         "call": 1.15e-06,
-        "demodulate_16": 7.28e-10,
-        "demodulate_32": 1.02e-09,
+        "demodulate_16": 3.3e-10,
+        "demodulate_32": 5.3e-10,
         "forward": 1.2e-10,
         "fold": 3.87e-10,
         "inverse": 2.45e-10,
@@ -52,8 +52,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
     },
     "cpu AVX2": {
         "call": 1.18e-06,
-        "demodulate_16": 1.04e-09,
-        "demodulate_32": 1.46e-09,
+        "demodulate_16": 5e-10,
+        "demodulate_32": 8e-10,
         "forward": 1.2e-10,
         "fold": 4.46e-10,
         "inverse": 2.44e-10,

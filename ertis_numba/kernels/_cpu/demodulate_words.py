@@ -87,18 +87,18 @@ def _lane(bit, word_bits, tap_bits):
 
 
 @njit(nogil=True, cache=True)
-def _fill_by_symbols(words, start, word, factor, taps, tables, tile):
-    """Fill ``tile`` (output, lane) with the sums of the taps of set bits, from sample ``start`` on."""
+def _fill_by_symbols(words, start, word, factor, taps, tables, tile, count):
+    """Fill ``count`` rows of ``tile`` (output, lane) with the sums of the taps of set bits, from ``start`` on."""
     symbols = np.empty(((_TILE - 1) * factor // SYMBOL + tables.shape[1], tile.shape[1]), taps.dtype)
-    fill_symbols(words, start * words.shape[1] + word, symbols)
-    for row in range(0, _TILE, GROUP):
+    fill_symbols(words, start * words.shape[1] + word, symbols[: (count - 1) * factor // SYMBOL + tables.shape[1]])
+    for row in range(0, count, GROUP):
         sum_symbols(symbols, tables, row * factor, factor, words, tile, row)
 
 
 @njit(nogil=True, cache=True)
-def _fill_by_masks(words, start, word, factor, taps, tables, tile):
+def _fill_by_masks(words, start, word, factor, taps, tables, tile, count):
     """Fill a tile likewise; ``tables`` are unused."""
-    for row in range(0, _TILE, GROUP):
+    for row in range(0, count, GROUP):
         at = (start + row * factor) * words.shape[1] + word
         _sum_masked_taps(words, at, factor * words.shape[1], taps, tile, row)
 
@@ -191,11 +191,12 @@ def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out
     for tap in range(taps.size):
         tap_total += np.int32(taps[tap])
     tables = tables_of(taps)
-    n_used = ((_TILE - 1) * factor // SYMBOL + tables.shape[1]) * SYMBOL
     for block in prange((out.shape[1] + _TILE - 1) // _TILE):
         begin = block * _TILE
         end = max(begin, min(begin + _TILE, n_outputs))
         start = (first + begin) * factor - taps.size // 2
+        count = (end - begin + GROUP - 1) // GROUP * GROUP
+        n_used = ((count - 1) * factor // SYMBOL + tables.shape[1]) * SYMBOL
         if begin == end:
             pass
         elif start < 0 or start + n_used > n_samples:
@@ -203,7 +204,7 @@ def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out
         else:
             tile = np.empty((_TILE, word_bits), taps.dtype)
             for word in range(n_words):
-                _fill_tile(words, start, word, factor, taps, tables, tile)
+                _fill_tile(words, start, word, factor, taps, tables, tile, count)
                 mics = _mics_of_lanes(channels, word, word_bits, 8 * taps.itemsize)
                 _turn_tile(tile, tap_total, scale, mics, begin, end, out)
         clear(out, end, min(begin + _TILE, out.shape[1]))
