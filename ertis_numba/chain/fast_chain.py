@@ -112,9 +112,12 @@ class FastChain(KernelChain):
         if not isinstance(beamform, StreamBeamform):
             super()._image(buffers, out, threads, beamform)
             return
-        self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
-        beamform.take(buffers.analytic, buffers.beamform)
-        if self._linear_filter is not None:
-            self._linear_filter(buffers.transforms, buffers.analytic, threads=threads)
-            beamform.take(buffers.analytic, buffers.beamform, linear=True)
+        transforms, analytic = buffers.transforms, buffers.analytic
+        spectra = transforms.forward(threads=threads)
+        self._matched_filter(transforms, analytic, threads=threads, spectra=spectra)
+        linear, filtered = beamform.linear, self._linear_filter
+        beamform.take(analytic, buffers.beamform, 1 if filtered and linear == 0 else 0)
+        if filtered:
+            filtered(transforms, analytic, threads=threads, spectra=spectra)
+            beamform.take(analytic, buffers.beamform, linear, linear + 1)
         beamform.combine(buffers.beamform, out)

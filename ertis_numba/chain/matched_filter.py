@@ -17,6 +17,8 @@ __all__ = ["Gain", "MatchedFilter", "flat_spectrum"]
 Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
 """Function of frequencies in hertz, (bin,), that returns gains, (mic, bin) or (1, bin)."""
 
+Spectra = NDArray[np.complex64] | None
+
 
 class MatchedFilter:
     """Matched filter that returns analytic signals, (mic, phase, sample), at the output rate in several phases.
@@ -47,14 +49,22 @@ class MatchedFilter:
         self._kernel = kernels.multiply_and_fold
         self.shape = (n_mics, n_phases, window.n_outputs)
 
-    def __call__(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
-        """Fill ``out``, (mic, phase, sample) complex64, with ``transforms`` that were planned for this array."""
-        self.fill_spectra(transforms, out, threads=threads)
+    def __call__(
+        self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int, spectra: Spectra = None
+    ) -> None:
+        """Fill ``out``, (mic, phase, sample) complex64, with ``transforms`` that were planned for this array.
+
+        ``spectra`` are those of the signals, from ``transforms``, if they were computed before.
+        """
+        self.fill_spectra(transforms, out, threads=threads, spectra=spectra)
         transforms.inverse(threads=threads)
 
-    def fill_spectra(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
+    def fill_spectra(
+        self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int, spectra: Spectra = None
+    ) -> None:
         """Fill ``out``, (mic, phase, k) complex64, with the filtered spectra, as `MultiplyAndFold` folds them."""
-        self._kernel(transforms.forward(threads=threads), self._responses, self.first_bin, out)
+        spectra = transforms.forward(threads=threads) if spectra is None else spectra
+        self._kernel(spectra, self._responses, self.first_bin, out)
 
 
 def flat_spectrum(

@@ -33,7 +33,7 @@ from ertis_numba.chain.plan_elements import (
 from ertis_numba.chain.planned_streams import PlannedStreams
 from ertis_numba.chain.sensitivity import Sensitivity
 from ertis_numba.chain.stream_plan import StreamPlanner
-from ertis_numba.chain.stream_recipe import recipe_of, uses_streams
+from ertis_numba.chain.stream_recipe import LINEAR, recipe_of, uses_streams
 from ertis_numba.chain.time_window import TimeWindow, time_window
 from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s
@@ -246,6 +246,7 @@ class PlanModel:
             precision=plan.precision,
             n_shifted=0 if plan.delay_taps else self.n_directions * len(self._zones(plan.focal_zones)),
             n_streams=len(self.streams(plan).streams) if streamed else 0,
+            n_filters=2 if streamed and any(each.stream == LINEAR for each in self.streams(plan).streams) else 1,
             term_cost=1.0 if streamed else self._kernel_cost(),
         )
 

@@ -123,10 +123,10 @@ class StreamBeamform:
         self.take(analytic, buffers)
         self.combine(buffers, out)
 
-    def take(self, analytic: NDArray[np.complex64], buffers: Buffers, *, linear: bool = False) -> None:
-        """Compute the streams of ``analytic``; all of them, or the stream ``linear`` only."""
+    def take(self, analytic: NDArray[np.complex64], buffers: Buffers, first: int = 0, stop: int | None = None) -> None:
+        """Compute the streams ``first … stop`` of ``analytic``, all by default."""
         tiles, scales = buffers
-        first, stop = (self.linear, self.linear + 1) if linear else (0, self._shape[1])
+        stop = self._shape[1] if stop is None else stop
         self._kernels.quantise_streams(
             *(analytic, self._starts, self._limits, self._units, self._powers, self._turns, first, stop, tiles, scales)
         )

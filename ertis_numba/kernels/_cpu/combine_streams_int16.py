@@ -9,11 +9,12 @@ from numba.extending import intrinsic
 from ertis_numba.kernels._cpu.amplitudes import amplitudes_of
 from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, Dot16
 from ertis_numba.kernels._cpu.grid_beams16 import fill_pairs, new_pairs
-from ertis_numba.kernels._cpu.spans import node_span
+from ertis_numba.kernels._cpu.spans import node_span, prefetch_row
 
 __all__ = ["combine_streams_int16"]
 
 _BLOCK = 1536  # directions: every thread gets some, and few grid points are summed twice
+_AHEAD = 4  # directions between the prefetch of a row and its use
 
 
 @intrinsic
@@ -127,6 +128,7 @@ def combine_streams_int16(
         short = np.empty((1, RANGES), np.float32)
         is_whole = starts[tile] + RANGES <= stop
         for direction in range(begin, end):
+            prefetch_row(out, rows[min(direction + _AHEAD, end - 1)], np.int64(starts[tile]), RANGES)
             entry = place = 0
             for stream in range(n_streams):
                 n_points, n_terms, n_pairs = shapes[stream, 0], np.int64(shapes[stream, 1]), np.int64(shapes[stream, 2])

@@ -77,13 +77,6 @@ def _turned(real, imag, turns, magnitude, x, y):
 
 
 @njit(nogil=True, cache=True)
-def _silenced(real, imag, y):
-    """Set y to 0 where the direction has no length, because there is no sound."""
-    for k in range(len(y)):
-        y[k] *= (_ZERO + real[k] * real[k]) + imag[k] * imag[k]
-
-
-@njit(nogil=True, cache=True)
 def _rounded(x, y, target):
     """Fill ``target`` with the rounded numbers (x, y, x, y …), and with 0 beyond the end."""
     for k in range(len(x)):
@@ -91,6 +84,26 @@ def _rounded(x, y, target):
         target[2 * k + 1] = np.int16(np.rint(y[k]))
     for k in range(2 * len(x), target.size):
         target[k] = np.int16(0)
+
+
+@njit(nogil=True, cache=True)
+def _plain(power, turns):
+    """Return True for y, and for |y|² with |y|, which need neither logarithms nor powers."""
+    return power == turns == 1 or (power == 2 and turns == 0)
+
+
+@njit(nogil=True, cache=True)
+def _without_powers(source, inverse, turns, limit, x, y):
+    """Fill x and y with the values of a `_plain` stream."""
+    if turns == 1:
+        factor = inverse * limit
+        for k in range(len(x)):
+            x[k], y[k] = source[2 * k] * factor, source[2 * k + 1] * factor
+        return
+    for k in range(len(x)):
+        a, b = source[2 * k] * inverse, source[2 * k + 1] * inverse
+        power = (_ZERO + a * a) + b * b
+        x[k], y[k] = limit * power, limit * np.sqrt(power)
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -111,13 +124,18 @@ def quantise_streams(signals, starts, limits, units, powers, turns, first, stop,
         count = end - begin
         real, imag, logarithm = work[0, :count], work[1, :count], work[2, :count]
         magnitude, x, y = work[3, :count], work[4, :count], work[5, :count]
+        needs_polar = False
+        for stream in range(first, stop):
+            needs_polar |= not _plain(powers[stream], turns[stream])
         for mic in range(n_mics):
             for phase in range(n_phases):
-                _polar(parts[mic, phase, 2 * begin : 2 * end], inverse, real, imag, logarithm, bits)
+                source = parts[mic, phase, 2 * begin : 2 * end]
+                if needs_polar:
+                    _polar(source, inverse, real, imag, logarithm, bits)
                 for stream in range(first, stop):
-                    _magnitudes(logarithm, powers[stream], limits[stream], magnitude, bits)
-                    _turned(real, imag, turns[stream], magnitude, x, y)
-                    if turns[stream] == 0:
-                        _magnitudes(logarithm, np.float32(0.5) * powers[stream], limits[stream], y, bits)
-                        _silenced(real, imag, y)
+                    if _plain(powers[stream], turns[stream]):
+                        _without_powers(source, inverse, turns[stream], limits[stream], x, y)
+                    else:
+                        _magnitudes(logarithm, powers[stream], limits[stream], magnitude, bits)
+                        _turned(real, imag, turns[stream], magnitude, x, y)
                     _rounded(x, y, targets[tile, stream, mic, phase])
