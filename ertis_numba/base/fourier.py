@@ -19,7 +19,7 @@ _FORWARD, _INVERSE, _REAL = True, False, True
 _NOT_NORMALISED, _NORMALISED = 0, 2
 
 
-class _Public:
+class _DocumentedFunctions:
     """Functions of the extension module, by those that SciPy documents."""
 
     @staticmethod
@@ -64,7 +64,7 @@ def _extension() -> Any:
         )
     except Exception:  # noqa: BLE001 - whatever another version of a private module raises
         expected = False
-    return found if expected else _Public
+    return found if expected else _DocumentedFunctions
 
 
 _LIBRARY: Final = _extension()

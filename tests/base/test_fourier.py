@@ -17,7 +17,7 @@ COMPLEX = REAL + 1j * REAL[::-1]
 @pytest.fixture(params=["extension", "public"])
 def library(request, monkeypatch):
     if request.param == "public":
-        monkeypatch.setattr(fourier, "_LIBRARY", fourier._Public)  # noqa: SLF001
+        monkeypatch.setattr(fourier, "_LIBRARY", fourier._DocumentedFunctions)  # noqa: SLF001
     return request.param
 
 
@@ -60,11 +60,11 @@ def wrong(*_):
 )
 def test_public_functions_replace_another_extension(monkeypatch, other):
     monkeypatch.setitem(sys.modules, fourier._EXTENSION, other)  # noqa: SLF001
-    assert fourier._extension() is fourier._Public  # noqa: SLF001
+    assert fourier._extension() is fourier._DocumentedFunctions  # noqa: SLF001
 
 
 @pytest.mark.parametrize("found", [None, types.SimpleNamespace(submodule_search_locations=["/none"])])
 def test_public_functions_replace_a_missing_extension(monkeypatch, found):
     monkeypatch.delitem(sys.modules, fourier._EXTENSION)  # noqa: SLF001
     monkeypatch.setattr(fourier, "find_spec", lambda _: found)
-    assert fourier._extension() is fourier._Public  # noqa: SLF001
+    assert fourier._extension() is fourier._DocumentedFunctions  # noqa: SLF001
