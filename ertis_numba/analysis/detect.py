@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
 from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
-from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, centred, listed
 from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
 from ertis_numba.analysis.uncertainty import PositionUncertainty
@@ -135,6 +135,7 @@ def peaks_of_grid(
             raise ArgumentError(f"where has dtype {where.dtype}; use bool, such as image.amplitude > 0.01")
     edges = EdgeFloor(directions, spread_of(image.settings))(image)
     places = _local_maxima(image.amplitude, neighbours, np.maximum(floor, edges), where)
+    places = np.stack(centred(image, neighbours, places[:, 0], places[:, 1]), axis=1)
     if false_alarm is not None:
         places = places[stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)

@@ -13,13 +13,15 @@ from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
 from ertis_numba.frames.level_codes import rounding_np
+from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Settings
 
-__all__ = ["PeakInterpolator", "Tops", "listed"]
+__all__ = ["PeakInterpolator", "Tops", "centred", "listed"]
 
 _MODEL = 2e-4  # Least error of a predicted sample, relative to the amplitude.
 _EDGE_OF_LOBE = 0.5  # Amplitude relative to the maximum, below which a sample is not part of the main lobe.
 _NOISE = 10 ** (0.5 / 20)  # Noise may raise a maximum above a main lobe through its strongest sample.
+_MAX_AREA = 1000  # Bins of an area of equal levels that are examined.
 _NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative to that of delay-and-sum, is at most so.
 
 
@@ -44,6 +46,35 @@ class Tops(NamedTuple):
 def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.float64]:
     """Return amplitudes that exceed the strongest bin by less than 1 dB, unlike interpolated ones of a coarse grid."""
     return np.minimum(amplitude, float(image.amplitude.max(initial=0.0)) * 10 ** (MAX_RISE_DB / 20))
+
+
+def centred(
+    image: Energyscape, neighbours: NDArray[np.int64], directions: NDArray[np.int64], ranges: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the places of maxima; of rounded levels, the middles of areas of one level that no neighbour exceeds."""
+    if not image.level_step_db:
+        return directions, ranges
+    looks, flat, n_ranges = (
+        unit_vectors(image.azimuth_rad, image.elevation_rad),
+        image.amplitude.reshape(-1),
+        len(image.range_m),
+    )
+    found: dict[int, None] = {}
+    for place in directions * n_ranges + ranges:
+        same = new = around = np.array([place])
+        while len(new) and len(same) < _MAX_AREA and flat[around].max() <= flat[place]:
+            row, column = np.divmod(new, n_ranges)
+            beside = neighbours[row] * n_ranges + column[:, None]
+            around = np.unique(np.concatenate([beside.ravel(), new[column > 0] - 1, new[column < n_ranges - 1] + 1]))
+            new = np.setdiff1d(around[flat[around] == flat[place]], same)
+            same = np.concatenate([same, new])
+        if flat[around].max() <= flat[place]:
+            row, column = np.divmod(same, n_ranges)
+            within = np.abs(column - column.mean()) <= 0.5
+            nearness = looks[row] @ looks[row].sum(axis=0)
+            found[int(same[np.argmax(np.where(within | (not within.any()), nearness, -np.inf))])] = None
+    kept = np.array([*found], dtype=np.int64)
+    return kept // n_ranges, kept % n_ranges
 
 
 class PeakInterpolator:

@@ -10,7 +10,7 @@ from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
 from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
-from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, centred, listed
 from ertis_numba.analysis.point_spread import spread_of
 from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
@@ -169,6 +169,7 @@ class PointExtractor:
         points = np.flatnonzero(~beaten.any(axis=1))
         strongest = points[np.argsort(-here[points, 0], kind="stable")[: self._top]]
         directions, ranges = directions[strongest], ranges[strongest]
+        directions, ranges = centred(image, self._neighbours, directions, ranges)
         if self._false_alarm is None:
             return directions, ranges
         stays = stands_out(image, directions, ranges, self._false_alarm, pulse_steps(image))

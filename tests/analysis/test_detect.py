@@ -7,6 +7,7 @@ import pytest
 
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.noise import noise_of
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape
@@ -169,3 +170,20 @@ def test_noise_below_the_lowest_level_yields_no_reflectors():
     assert find_peaks(rounded) == []
     assert noise_of(rounded) == pytest.approx(10 ** (-122 / 20) / math.sqrt(math.log(2)), rel=0.01)
     assert find_peaks(rounded.replace(level_step_db=0.0))
+
+
+@pytest.mark.parametrize("directions", ["2d:181", "3d:600"])
+def test_rounded_levels_yield_one_reflector_without_a_bias(directions):
+    """Of an area of equal levels, the middle counts, not the bin with the lowest number."""
+    levels, errors_deg = LevelCodes(-122.0), []
+    for azimuth_deg in np.random.default_rng(4).uniform(-40, 40, 12):
+        given = image_of([(azimuth_deg, 0, 1.2345, 1.0)], directions=directions)
+        amplitude = levels.decode(levels.encode(given.amplitude))
+        rounded = given.replace(amplitude=amplitude, level_step_db=levels.step_db)
+        (peak,) = find_peaks(rounded, min_level_db=-6)
+        cloud = PointExtractor(rounded.settings, min_level_db=-6)(rounded)
+        assert len(cloud) == 1
+        assert peak.range_m == pytest.approx(1.2345, abs=1e-3)
+        errors_deg.append(peak.azimuth_deg - azimuth_deg)
+    assert np.abs(errors_deg).max() < 1.5
+    assert abs(np.mean(errors_deg)) < 0.25
