@@ -57,6 +57,8 @@ def in_words(accuracy: Accuracy) -> str:
     if accuracy.beam_taps:
         parts.append(f"beam grid {accuracy.beam_taps} × {accuracy.beam_density:g}")
     parts.append(f"{accuracy.stopband_attenuation_db:g} dB")
+    if accuracy.row_beams:
+        parts.append("rows first")
     if accuracy.focal_zones and accuracy.focal_zones > 1:
         parts.append(f"{accuracy.focal_zones} zones")
     return ", ".join(parts)

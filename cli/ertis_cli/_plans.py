@@ -62,6 +62,8 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     yield f"  {precision}, {_delays_in_words(accuracy)}"
     if plan["streams"]:
         yield "  adaptive amplitudes from delay-and-sums of streams, some with fewer taps and coarser beam grids"
+    if accuracy.row_beams:
+        yield "  the beams of each row of microphones are summed first, and the beams of the array from these"
     if accuracy.beam_taps:
         yield (
             f"  beams interpolated from {accuracy.beam_taps} beam-grid points along each axis of the array, "

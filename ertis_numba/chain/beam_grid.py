@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.chain.interpolation_fit import Spectrum, fit, gain_of, two_columns, weights_of, without_small
+from ertis_numba.chain.rows import aligned_axes
 from ertis_numba.kernels import SteeringKernels, load_steering
 
 __all__ = ["FEWEST_RANGES", "Aperture", "BeamGrid", "estimated_mics", "require_beam_grid"]
@@ -38,7 +39,7 @@ _FEWEST_EQUATIONS = 120  # Microphones times frequencies. With fewer equations, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aperture:
-    """Microphones and directions in the principal axes of the array: one axis for a line, two for a plane.
+    """Microphones and directions in the principal axes of the array, or along its rows: one for a line, else two.
 
     ``positions_m`` (mic, axis), longest axis first; ``directions`` (direction, axis), components of unit vectors;
     ``square_m2`` (mic,), squared distance from the centre; ``axes`` (axis, 3) in the sensor frame. With ``is_turned``,
@@ -56,6 +57,8 @@ class Aperture:
         """Return the aperture for microphone positions, (mic, 3) in metres, and unit vectors, (direction, 3)."""
         _, extent_m, axes = np.linalg.svd(positions_m, full_matrices=False)
         axes = axes[extent_m > _FLAT_M * math.sqrt(len(positions_m))]
+        if len(axes) == 2:  # The principal axes of a square are arbitrary, and its beam grid is finest along rows.
+            axes = aligned_axes(positions_m @ axes.T) @ axes
         return cls(positions_m @ axes.T, directions @ axes.T, np.sum(positions_m**2, axis=1), axes, is_turned)
 
     def turned(self, directions: NDArray[np.float64]) -> Self:

@@ -22,6 +22,7 @@ from ertis_numba.chain.plan_elements import (
     spectrum_of,
     zones_of,
 )
+from ertis_numba.chain.row_beams import row_tables
 from ertis_numba.chain.stream_beamform import StreamBeamform, StreamTables, amplitudes_of_stream
 from ertis_numba.chain.stream_plan import StreamPlanner
 from ertis_numba.chain.stream_recipe import LINEAR, recipe_of, uses_streams
@@ -58,12 +59,13 @@ class BeamTables:
         if uses_streams(settings.processing, plan):
             self.streams = PlanStreams(settings, spectrum, self.aperture, self._speed_m_s)
         self._nodes = None if self.streams else beam_grid_of(settings, self.aperture, spectrum)
+        self._rows = row_tables(settings, self.aperture, self._nodes, self._fit, spectrum) if plan.row_beams else None
         self._has_shifts = plan.delay_taps == 0
         self.own_s, weights = layout.delay_s[layout.enabled], array_weights(settings)
         self._amplitudes = weights / (layout.gain[layout.enabled] * len(self.own_s))
         self.ahead_s = np.zeros(len(self.own_s)) if self._has_shifts else ahead_of(weights, step_s)
         self._edges = zones_of(settings)
-        self.margin_s = (self._fit.n_taps // 2 + 2) * step_s
+        self.margin_s = (self._fit.n_taps // 2 + 2) * step_s * (1 if self._rows is None else 2)
         self.largest_delay_s = self._largest_delay_s()
 
     def turned(self, grid: Grid, steering: SteeringKernels) -> Self:
@@ -81,7 +83,8 @@ class BeamTables:
             return np.ones((1, len(frequency_hz)), dtype=np.complex128)
         if self._has_shifts:
             return np.repeat(self._amplitudes[:, None], len(frequency_hz), axis=1).astype(np.complex128)
-        return np.asarray(self._fit.gain(frequency_hz) * (1 if self._nodes is None else self._nodes.gain(frequency_hz)))
+        gain = self._fit.gain(frequency_hz) * (1 if self._nodes is None else self._nodes.gain(frequency_hz))
+        return np.asarray(gain if self._rows is None else gain * self._rows.gain(frequency_hz))
 
     def beamform(
         self, kernels: KernelSet, memory: Memory, window: TimeWindow, matched_filter: MatchedFilter
@@ -90,6 +93,11 @@ class BeamTables:
         plan, n_phases = self._settings.accuracy, self._settings.accuracy.oversampling or 1
         # Buffers must have room for any directions of a tilted sensor.
         last_sample = 2 * window.lead if self.aperture.is_turned else None
+        if self._rows is not None:
+            return self._rows.beamform(
+                kernels, memory, window, self._edges, self.own_s - self.ahead_s, self._amplitudes,
+                n_phases=n_phases, rate_hz=self._settings.output_rate_hz, threads=self._threads,
+            )  # fmt: skip
         points = self._points[0]
         delayed = (
             (first, stop, self.own_s - self.ahead_s + self._waves_s(points, range_m))
@@ -144,6 +152,8 @@ class BeamTables:
             reach = 1.0 if self._nodes is None else self._nodes.reach
             reach = reach if self.streams is None else self.streams.reach
             return self.aperture.largest_delay_s(reach, self.own_s, sound_speed_m_s=self._speed_m_s)
+        if self._rows is not None:
+            return self._rows.largest_delay_s(self.own_s, [range_m for *_, range_m in self._edges])
         return max(
             float(np.max(np.abs(self.own_s + self._waves_s(some, range_m))))
             for _, _, range_m in self._edges

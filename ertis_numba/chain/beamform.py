@@ -174,7 +174,7 @@ class _WholeZone:
 
 
 class BeamformInt16:
-    """Delay-and-sum beamformer on 16-bit samples, scaled for each tile of ranges; implements `Beamform`."""
+    """Delay-and-sum beamformer on 16-bit samples, scaled for each tile of ranges; signals begin at range ``origin``."""
 
     # Weights get 12 bits of a product, or half if there are fewer than 24, so that `x · Σ|w| ≤ 2³¹`.
 
@@ -188,6 +188,7 @@ class BeamformInt16:
         n_phases: int,
         threads: int,
         last_sample: int | None = None,
+        origin: int = 0,
     ) -> None:
         whole = WholeWeights([zone.table for zone in zones], nodes)
         self._limit, self._weight_scale = whole.limit, whole.unit
@@ -207,7 +208,7 @@ class BeamformInt16:
                 )
             )
             starts += mine
-        self._starts = memory.table(np.array(starts, dtype=np.int32))
+        self._starts = memory.table(np.array(starts, dtype=np.int32) - np.int32(origin))
         n_mics = 1 + int(zones[0].table.rows.max()) // n_phases
         self._shape = (len(starts), n_mics, n_phases, width, 2)
         self._nodes = None if nodes is None else _NodeTables(memory, nodes, whole.tap_weights)

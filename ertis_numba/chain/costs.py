@@ -66,8 +66,8 @@ class Work:
     ``n_words`` are those of a sample, ``tap_bits`` those of a filter tap; ``n_outputs`` are the samples of each phase.
     ``n_computed`` counts the ranges of all tiles, some of which are unused. ``n_beams`` are summed from ``n_terms``
     each; ``n_pairs`` of grid points per direction are 0 without a beam grid. ``n_shifted`` beams are summed as spectra,
-    one for each direction and focal zone. Signals pass ``n_filters`` matched filters. ``term_cost`` is the time of a
-    term relative to that of delay-and-sum.
+    one for each direction and focal zone. ``n_rows`` beams of rows take ``n_row_terms`` products in all. Signals pass
+    ``n_filters`` matched filters. ``term_cost`` is the time of a term relative to that of delay-and-sum.
     """
 
     n_mics: int
@@ -89,6 +89,8 @@ class Work:
     n_shifted: int = 0
     n_streams: int = 0
     n_filters: int = 1
+    n_rows: int = 0
+    n_row_terms: int = 0
     term_cost: float = 1.0
 
 
@@ -105,18 +107,20 @@ class Costs:
         # The samples of a tile fit into the first cache level with few phases, and not even into the second with many.
         # More phases never count as cheaper, even if they were measured to be.
         terms = np.maximum.accumulate([unit[f"sum_{work.precision}_{name}"] for name in _PHASES])
-        octaves, known = math.log2(rows / _MICS), np.log2(list(_PHASES.values()))
+        signals = (work.n_rows or work.n_mics) * work.n_phases
+        octaves, known = math.log2(signals / _MICS), np.log2(list(_PHASES.values()))
         # Beyond the largest measured number, as with a thousand microphones, the cost continues to rise.
         rise = (terms[-1] - terms[-2]) / (known[-1] - known[-2])
         term = float(np.interp(octaves, known, terms) + rise * max(0.0, octaves - known[-1]))
         points = work.n_directions * work.n_ranges
-        quantised = rows * (1 + _BEYOND) * work.n_computed if work.precision == "int16" else 0.0
+        quantised = signals * (1 + _BEYOND) * work.n_computed if work.precision == "int16" else 0.0
         seconds = {
             "demodulate": unit[f"demodulate_{work.tap_bits}"] * work.n_samples * work.n_taps * work.n_words,
             "matched filter": unit["forward"] * work.n_mics * _transform(work.n_fft)
             + unit["fold"] * rows * work.n_bins * (2 if work.n_shifted else work.n_filters)
             + unit["inverse"] * (work.n_shifted or rows * work.n_filters) * _transform(work.n_outputs),
             "16 bits": unit["quantise"] * quantised * (1 + _STREAM * work.n_streams),
+            "rows": unit["sum_float32_many"] * work.n_row_terms,
             "sums": work.term_cost * term * work.n_beams * work.n_terms * work.n_computed
             + unit["shift"] * work.n_shifted * work.n_mics * work.n_bins,
             "interpolation": unit[f"pair_{work.precision}"]

@@ -35,12 +35,15 @@ class DelayTable:
         n_phases: int,
         lead: int,
     ) -> Self:
-        """Return the delay table of ``delays_s`` (beam, mic); ``lead`` is the sample at the first range."""
+        """Return the delay table of ``delays_s`` (beam, mic); ``lead`` is the sample at the first range.
+
+        ``amplitudes`` are those of microphones, (mic,), or of terms, (beam, mic).
+        """
         n_beams, n_mics = delays_s.shape
         first, fractions = fit.split(delays_s)
         samples, phases = np.divmod(first[:, :, None] + np.arange(fit.n_taps), n_phases)
         rows = np.arange(n_mics)[:, None] * n_phases + phases
-        weights = fit.weights(fractions, steering) * amplitudes[:, None]
+        weights = fit.weights(fractions, steering) * amplitudes[..., None]
         flat = (n_beams, n_mics * fit.n_taps)
         return cls(rows.reshape(flat), samples.reshape(flat) + lead, weights.reshape(flat))
 

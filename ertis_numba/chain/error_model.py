@@ -128,9 +128,18 @@ class ErrorModel:
                 * max(1.0, 0.5 / signal_model.gain)
             )
         errors = fit.errors if passed is None else fit.errors * passed
-        varying, shared = float(errors @ signal_model.shares), float(fit.biases @ signal_model.shares)
+        varying = float(errors @ signal_model.shares)
         independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
-        return signal_model.colour * (independent + 0.5 * shared)
+        return signal_model.colour * independent + self.shared_delays(fit)
+
+    def late(self, variance_s2: float) -> float:
+        """Return the error power of delays whose errors have this variance over microphones, in s²."""
+        turn_2 = (2 * math.pi * self.frequency_hz) ** 2 @ self.signal_model.shares
+        return self._of(float(turn_2) * variance_s2)
+
+    def shared_delays(self, fit: DelayFit) -> float:
+        """Return the error power of delays that all microphones share, as part of `delays`."""
+        return 0.5 * self.signal_model.colour * float(fit.biases @ self.signal_model.shares)
 
     @property
     def needs_steering(self) -> bool:

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.chain.beam_grid import Aperture, BeamGrid
 from ertis_numba.chain.focal_zones import NEAREST_M, zone_edges
 from ertis_numba.chain.interpolation_fit import WAVES, DelayFit, Spectrum
+from ertis_numba.chain.rows import LEAST_PER_ROW, Rows, rows_of
 from ertis_numba.chain.time_window import time_window
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.geometry.waveform import decimation_taps, integer_taps, matched_band_hz, matched_noise_spectrum
@@ -28,7 +30,10 @@ __all__ = [
     "fitted",
     "grid_points",
     "nearest_m_of",
+    "planned_rows",
+    "require_rows",
     "ringing_db",
+    "row_aperture",
     "spectrum_of",
     "zones_of",
 ]
@@ -39,6 +44,30 @@ _MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceed
 _MAX_PDM_RINGING_DB = 138.0  # The same for PDM, where sound outside the image exceeds it by less.
 _MAX_PASS_BAND = 0.45  # relative to the signal rate; the filter becomes long beyond it
 _SHORT_TAPS_DB = 65.0  # Rounding taps to 16 bits limits the stopband attenuation to this value.
+
+
+@functools.lru_cache(maxsize=8)
+def row_aperture(aperture: Aperture, rows: Rows) -> Aperture:
+    """Return the microphones and directions along the rows as those of one line, cached like `aperture_of`."""
+    along_m = aperture.positions_m[:, [rows.along]]
+    return Aperture(along_m, aperture.directions[:, [rows.along]], along_m[:, 0] ** 2, aperture.axes[[rows.along]])
+
+
+def planned_rows(aperture: Aperture) -> Rows | None:
+    """Return the rows of an array whose beams may be summed first; None if it is no plane, or may be tilted."""
+    is_plane = aperture.supports_grid and aperture.n_axes == 2
+    return rows_of(aperture.positions_m) if is_plane and not aperture.is_turned else None
+
+
+def require_rows(settings: Settings, aperture: Aperture) -> Rows:
+    """Return the rows of an array, or refuse settings that have none."""
+    rows = None if settings.processing.is_adaptive else planned_rows(aperture)
+    if rows is None:
+        raise ArgumentError(
+            "accuracy.row_beams is true, which needs delay_and_sum without a weighting, fixed directions, and a plane "
+            f"array with a mean of {LEAST_PER_ROW} or more microphones per row; leave it out or use false"
+        )
+    return rows
 
 
 def spectrum_of(settings: Settings) -> Spectrum:

@@ -26,10 +26,13 @@ from ertis_numba.chain.plan_elements import (
     fitted,
     grid_points,
     nearest_m_of,
+    planned_rows,
+    require_rows,
     ringing_db,
     spectrum_of,
     zones_of,
 )
+from ertis_numba.chain.planned_rows import PlannedRows
 from ertis_numba.chain.planned_streams import PlannedStreams
 from ertis_numba.chain.sensitivity import Sensitivity
 from ertis_numba.chain.stream_plan import StreamPlanner
@@ -54,6 +57,10 @@ Echoes of `data/synthetic/reflectors.h5` had −48.3 to −49.2 dB with plans fo
 """
 
 
+_ALONG_ROWS = 2.0
+"""Margin on errors of interpolation along rows, which are alike in all rows, from scenes of test_row_beams.py."""
+
+
 class ImagePlan(NamedTuple):
     """Complete plan: a value for every accuracy setting."""
 
@@ -64,6 +71,7 @@ class ImagePlan(NamedTuple):
     density: float
     stopband_attenuation_db: float
     focal_zones: int
+    row_beams: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +121,14 @@ class PlanModel:
         self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
         if settings.accuracy.beam_taps:
             require_beam_grid(self.aperture, len(self.window.range_m))
+        if settings.accuracy.row_beams:
+            require_rows(settings, self.aperture)
+        rows = planned_rows(self.aperture)
+        self.rows = (
+            None
+            if rows is None
+            else PlannedRows(rows, self.aperture, nearest_m=self._nearest_m, sound_speed_m_s=self._speed_m_s)
+        )
         recipe = recipe_of(settings.processing)
         self.has_streams = settings.processing.is_adaptive and recipe is not None
         self._stream_planner = (
@@ -142,9 +158,37 @@ class PlanModel:
         if nodes is not None:
             parts["beams"] = nodes.error
             parts["delays"] = self._delays_between(nodes, plan, delays.error)
+        if plan.row_beams and nodes is not None:
+            return self._row_parts(parts, plan, delays, nodes)
         if plan.precision == "int16":
             parts["samples"] = self._spread * self._whole_numbers(delays, None if nodes is None else nodes.squares)
         return parts
+
+    def _row_parts(self, parts: dict[str, float], plan: ImagePlan, delays: Delays, nodes: Nodes) -> dict[str, float]:
+        """Add the error powers of beams of rows to those of the microphones; 16 bits hold beams of rows only."""
+        assert self.rows is not None  # noqa: S101
+        rows, passed = self.rows, max(1.0, nodes.squares)
+        fit, _ = fitted(self._spectrum, plan.delay_taps, 1 / (self.settings.output_rate_hz * plan.n_phases))
+        again = self.errors.delays(fit, n_mics=len(rows.rows)) + 2 * self.errors.shared_delays(fit)
+        parts["delays"] = passed * (delays.error + again)
+        parts["beams"] += self._row_delay_error
+        squares = nodes.squares
+        if rows.is_curved:
+            power, along = estimated_errors(self._row_beams(plan))
+            parts["beams"] += _ALONG_ROWS * passed * self.errors.uniform_beams(power)
+            squares *= max(1.0, along)
+        n_terms = len(rows.rows) * (plan.beam_taps if rows.is_curved else 1)
+        per_row = self.n_mics / len(rows.rows)  # A beam of a row may exceed the others by so much.
+        parts["samples"] = self._spread * per_row * self._whole_numbers(delays, squares, n_terms)
+        return parts
+
+    @functools.cached_property
+    def _row_delay_error(self) -> float:
+        return 0.0 if self.rows is None else self.rows.delay_error(self.errors, self.window.range_m)
+
+    def _row_beams(self, plan: ImagePlan) -> PlannedBeams:
+        assert self.rows is not None  # noqa: S101
+        return self._beams(plan.beam_taps, plan.density)._replace(aperture=self.rows.line)
 
     def _common_parts(self, plan: ImagePlan) -> dict[str, float]:
         """Return the error power of the steps that every plan has."""
@@ -223,6 +267,10 @@ class PlanModel:
                 (each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams
             )
             n_pairs = sum(each.grid.n_pairs for each in streams if each.grid)
+        n_rows = n_row_terms = 0
+        if plan.row_beams and self.rows is not None:
+            n_rows, n_row_terms = self._row_counts(plan)
+            n_terms = len(self.rows.rows) * plan.delay_taps * (plan.beam_taps if self.rows.is_curved else 1)
         taps, _ = self.filter(plan.stopband_attenuation_db)
         # Phase shifts take a transform per direction, so that its length matters.
         window = self.window if plan.delay_taps else self._windows(plan.stopband_attenuation_db)
@@ -247,8 +295,20 @@ class PlanModel:
             n_shifted=0 if plan.delay_taps else self.n_directions * len(self._zones(plan.focal_zones)),
             n_streams=len(self.streams(plan).streams) if streamed else 0,
             n_filters=2 if streamed and any(each.stream == LINEAR for each in self.streams(plan).streams) else 1,
+            n_rows=n_rows,
+            n_row_terms=n_row_terms,
             term_cost=1.0 if streamed else self._kernel_cost(),
         )
+
+    def _row_counts(self, plan: ImagePlan) -> tuple[int, int]:
+        """Return the number of beams of rows, and that of the products of their samples in all focal zones."""
+        assert self.rows is not None  # noqa: S101
+        high_hz, rows = self.settings.call.high_frequency_hz, self.rows
+        spacing = self.aperture.spacing(plan.density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
+        n_beams = len(rows.rows) * rows.count_points(spacing, plan.beam_taps)
+        more = 2 * math.ceil(rows.reach_s * self.settings.output_rate_hz + plan.delay_taps / plan.n_phases)
+        n_samples = sum(stop - first + more for first, stop, _ in self._zones(plan.focal_zones))
+        return n_beams, n_beams * plan.n_phases * n_samples * rows.rows.most * plan.delay_taps
 
     def _kernel_cost(self) -> float:
         """Return the time of the kernels of all microphones, relative to delay-and-sum in single precision."""
@@ -271,6 +331,12 @@ class PlanModel:
             return n_delays * (SHIFT_TABLE_BYTES + SHIFT_BYTES * n_zones) + 8 * n_rows * self.window.n_outputs
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self.n_directions if nodes is None else nodes.count
+        if plan.row_beams and self.rows is not None:
+            n_row_beams, _ = self._row_counts(plan)
+            n_terms = n_row_beams * plan.n_phases * self.rows.rows.most
+            n_terms += n_beams * len(self.rows.rows) * (plan.beam_taps if self.rows.is_curved else 1)
+            signals += 16 * n_row_beams * plan.n_phases * self.window.n_outputs
+            return signals + TABLE_BYTES * n_terms * plan.delay_taps * len(self._zones(plan.focal_zones))
         table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
         return table + signals
 
@@ -342,18 +408,17 @@ class PlanModel:
             return np.ones(1, dtype=np.int16), math.inf
         return taps, self.errors.filter(taps)
 
-    def _whole_numbers(self, delays: Delays, node_squares: float | None) -> float:
+    def _whole_numbers(self, delays: Delays, node_squares: float | None, n_summed: int | None = None) -> float:
         """Return the error power of 16 bits; ``node_squares`` is that of `Nodes`, None without a beam grid."""
-        weight_limit, limit = whole_limits(self.n_mics * delays.sum_of_weights)
+        n_summed = self.n_mics if n_summed is None else n_summed
+        weight_limit, limit = whole_limits(n_summed * delays.sum_of_weights)
         squares = 1.0 if node_squares is None else node_squares
         error = self.errors.samples(
             n_terms=delays.n_taps, terms=delays.squares, limit=limit, weight_limit=weight_limit, taps=squares
         )
         if node_squares is not None:
-            filled = limit * weight_limit * self.n_mics * delays.sum_of_weights / 2**31
-            error += self.errors.nodes(
-                n_mics=self.n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
-            )
+            filled = limit * weight_limit * n_summed * delays.sum_of_weights / 2**31
+            error += self.errors.nodes(n_mics=n_summed, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled)
         return error
 
     def _n_bins(self, window: TimeWindow) -> int:
@@ -385,4 +450,5 @@ def plan_of(accuracy: Accuracy) -> ImagePlan:
         accuracy.beam_density or 2.0,
         accuracy.stopband_attenuation_db or 60.0,
         accuracy.focal_zones or 1,
+        bool(accuracy.row_beams),
     )

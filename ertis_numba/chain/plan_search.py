@@ -16,6 +16,7 @@ _STREAM_TAPS = (1, 2, 3, 4)  # Streams are not smooth enough for more.
 _STOPBAND_ATTENUATIONS_DB = (MIN_STOPBAND_ATTENUATION_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
 _N_STOPBAND_ATTENUATIONS = 3  # Number of candidates; more attenuation brings no benefit.
 _NEEDLESS = 0.02  # Share of the budget below which the error of a step is negligible.
+_FEWEST_FOR_ROWS = 64  # Smaller arrays gain nothing.
 _SMALL = 0.1  # Share of the budget for steps whose error costs little to reduce.
 
 
@@ -44,9 +45,36 @@ def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
     )
     if adaptive:
         return plans + _open_streams(model, budget)
-    return plans + [
-        ImagePlan("float32", 1, 0, 0, given.beam_density or 2.0, stopband_attenuation_db, zones)
-        for stopband_attenuation_db in (_stop_bands_db(model, budget) if _may_be_shifted(model.settings) else ())
+    rows = _open_rows(model, budget, zones)
+    if given.row_beams:
+        return rows
+    return (
+        plans
+        + rows
+        + [
+            ImagePlan("float32", 1, 0, 0, given.beam_density or 2.0, stopband_attenuation_db, zones)
+            for stopband_attenuation_db in (_stop_bands_db(model, budget) if _may_be_shifted(model.settings) else ())
+        ]
+    )
+
+
+def _open_rows(model: PlanModel, budget: float, zones: int) -> list[ImagePlan]:
+    """Return the candidates that sum the beams of rows first."""
+    given = model.settings.accuracy
+    fixed = (given.oversampling, given.delay_taps, given.beam_taps, given.stopband_attenuation_db)
+    # A complete plan of earlier versions has no rows.
+    if given.row_beams is None and (model.n_mics < _FEWEST_FOR_ROWS or None not in fixed):
+        return []
+    if model.rows is None or given.row_beams is False or given.precision == "float32" or 0 in fixed:
+        return []
+    return [
+        ImagePlan("int16", n_phases, n_taps, beam_taps, density, stopband_attenuation_db, zones, row_beams=True)
+        for (n_phases, n_taps), (beam_taps, density), stopband_attenuation_db in itertools.product(
+            _open_delays(model, budget, adaptive=False),
+            _open_nodes(model, budget, adaptive=False, most=math.inf),
+            _stop_bands_db(model, budget),
+        )
+        if beam_taps
     ]
 
 
@@ -127,9 +155,12 @@ def _open_delays(model: PlanModel, budget: float, *, adaptive: bool) -> list[tup
     return found or [(phases[-1], n_taps) for n_taps in taps]
 
 
-def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
+def _open_nodes(
+    model: PlanModel, budget: float, *, adaptive: bool, most: float | None = None
+) -> list[tuple[int, float]]:
     """Return the candidates for beam taps and density of the beam grid; 0 taps stand for one beam per direction."""
     given = model.settings.accuracy
+    most = model.n_directions if most is None else most
     flat = model.aperture.supports_grid and len(model.window.range_m) >= FEWEST_RANGES
     if adaptive or given.beam_taps == 0 or not (flat or given.beam_taps):
         return [(0, given.beam_density or 2.0)]
@@ -137,7 +168,7 @@ def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tupl
     for beam_taps in [given.beam_taps] if given.beam_taps else GRID_DENSITIES:
         densities = GRID_DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
         for density in densities:  # The coarsest grid is the cheapest. The loop ends at needlessly accurate ones.
-            if not given.beam_taps and model.count_grid_points(beam_taps, density) >= model.n_directions:
+            if not given.beam_taps and model.count_grid_points(beam_taps, density) >= most:
                 break
             error = model.nodes(beam_taps, density).error
             if error <= budget or given.beam_taps:

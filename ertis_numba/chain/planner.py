@@ -215,6 +215,7 @@ class Planner:
             beam_density=plan.density,
             stopband_attenuation_db=plan.stopband_attenuation_db,
             focal_zones=plan.focal_zones,
+            row_beams=True if plan.row_beams else self.settings.accuracy.row_beams,
         )
 
     def _time(self, plan: ImagePlan, costs: Costs) -> float:
@@ -237,7 +238,12 @@ def _worst(chosen: Chosen) -> str:
 
 
 def _no_plan(settings: Settings) -> str:
-    """Return the reason why no plan exists: the settings exclude streams, and spherical wavefronts need them."""
+    """Return the reason why no plan exists: rows need a beam grid, and spherical wavefronts of others streams."""
+    if settings.accuracy.row_beams:
+        return (
+            "accuracy.row_beams is true, but it needs a beam grid, an image of at least 64 ranges, and an "
+            "accuracy.delay_taps of 1 or more; extend processing.range_m, or leave row_beams out"
+        )
     return (
         f"processing.beamformer {settings.processing.beamformer!r} with weighting {settings.processing.weighting!r} "
         "needs 16-bit streams for spherical wavefronts, but the accuracy settings exclude them; use "

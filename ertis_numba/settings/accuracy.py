@@ -15,7 +15,12 @@ ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -
 MAX_FOCAL_ZONES = 1_000_000
 """Limit on the number of focal zones; more than an image has ranges, even near the array."""
 
-_EXACT_DELAYS = (("precision", ("auto", "float32")), ("oversampling", (None, 1)), ("beam_taps", (None, 0)))
+_EXACT_DELAYS = (
+    ("precision", ("auto", "float32")),
+    ("oversampling", (None, 1)),
+    ("beam_taps", (None, 0)),
+    ("row_beams", (None, False)),
+)
 """Values that exact delays support; the last one is what they use."""
 
 
@@ -51,6 +56,10 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         call's band.
     focal_zones : int, optional, default None
         Number of focal zones for spherical wavefronts. Ranges within a focal zone share their delays.
+    row_beams : bool, optional, default None
+        Sum the beams of each row of microphones first, and the beams of the array from these. This needs a plane array
+        with rows, fixed directions, ``precision`` ``int16`` and a beam grid, and is for ``delay_and_sum`` without a
+        weighting.
     """
 
     max_error_db: Annotated[float, Limits(-200.0, 0.0)] = -35.0
@@ -61,11 +70,17 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     beam_density: Annotated[float, Limits(1.1, 8.0)] | None = None
     stopband_attenuation_db: Annotated[float, Limits(40.0, 140.0)] | None = None
     focal_zones: Annotated[int, Limits(1, MAX_FOCAL_ZONES)] | None = None
+    row_beams: bool | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.beam_taps is not None:
             checks.choice("accuracy.beam_taps", self.beam_taps, (0, 2, 4, 6))
+        if self.row_beams and (self.precision == "float32" or self.beam_taps == 0):
+            raise ArgumentError(
+                "accuracy.row_beams is true, which needs accuracy.precision 'int16' and accuracy.beam_taps 2, 4 or 6; "
+                "leave these keys out, or use row_beams false"
+            )
         if self.delay_taps == 0:
             self._check_phase_shifts()
 

@@ -142,4 +142,4 @@ def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):
     assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".rviz", ".toml", ".typed", ".yaml", ""}
     # A recording has a megabyte. Code grows with each feature, so that data are limited by themselves.
     assert sum(sizes[name] for name in names if Path(name).suffix not in {".py", ".pyi"}) <= 30e3
-    assert wheel.stat().st_size <= 2e6
+    assert wheel.stat().st_size <= 2.1e6

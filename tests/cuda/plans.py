@@ -73,6 +73,22 @@ PLANS = {
         -120,
     ),
 }
+ROWS = TINY.replace(
+    array=Array(
+        layout="rows",
+        positions_m=tuple((0.0, 0.004 * mic, 0.006 * row) for row in range(2) for mic in range(4)),
+        word_bits=8,
+    ),
+    accuracy=NODES.replace(precision="int16", row_beams=True),
+    processing=TINY.processing.replace(directions="3d:6"),
+)
+PLANS["rows"] = ROWS, -90
+PLANS["rows, two zones"] = (
+    ROWS.replace(
+        processing=ROWS.processing.replace(wavefront="spherical"), accuracy=ROWS.accuracy.replace(focal_zones=2)
+    ),
+    -90,
+)
 PLANS["paper"] = (
     TINY.replace(
         recording=Recording(n_samples=4_096),
