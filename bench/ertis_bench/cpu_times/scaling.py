@@ -23,7 +23,8 @@ _BASE = {"directions": 1850, "last_range_m": 5.0, "microphones": 32}
 SERIES: dict[str, tuple[float, ...]] = {
     "directions": (90, 250, 500, 1000, 1850, 3000, 6000),
     "last_range_m": (1.0, 2.0, 3.0, 4.0, 5.0),
-    "microphones": (8, 16, 32, 64, 128),
+    "microphones": (8, 16, 32, 64, 128, 256),
+    "microphones_in_a_square_grid": (64, 256, 1024),
     "batch": (1, 2, 4, 8, 16),
 }
 """Varied parameters and their values.
@@ -34,6 +35,7 @@ The other values are 1850 directions, 0.5-5 m, 32 microphones, all threads, and 
 _PRESET = "default_25_50"
 _FIRST_RANGE_M = 0.5
 _APERTURE_M = 0.1
+_PITCH_M = 0.0039
 _STREAM = 16 * 2**20  # numbers per array: 64 MiB, several times the last-level cache
 _TURNS = 200_000
 _STRANDS_PER_THREAD = 8
@@ -69,7 +71,9 @@ def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
     n_ranges: dict[str, int] = {}
     for value in _thread_counts() if series == "threads" else SERIES[series]:
         threads = int(value) if series == "threads" else None
-        settings, n_words = _settings(plan, **{**_BASE, **({series: value} if series in _BASE else {})})
+        settings, n_words = _settings(
+            plan, **{**_BASE, **({series: value} if series not in {"batch", "threads"} else {})}
+        )
         pipeline = Pipeline(settings, "cpu", threads, predict=False)
         measurement = input_measurements.noise(settings, n_words=n_words)
         image = pipeline.process(measurement)
@@ -90,14 +94,24 @@ def _thread_counts() -> list[int]:
     return [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n < largest] + [largest]
 
 
-def _settings(plan: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
-    """Return settings and words per sample, with microphones at random positions on a disc."""
-    n_mics, settings = int(microphones), Settings.from_preset(_PRESET)
-    random = np.random.default_rng(1)
-    radius_m = _APERTURE_M / 2 * np.sqrt(random.random(n_mics))
-    angle_rad = 2 * np.pi * random.random(n_mics)
-    positions_m = np.stack([np.zeros(n_mics), radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)], axis=1)
-    array = Array(layout=f"disc of {n_mics}", positions_m=tuple(map(tuple, positions_m.tolist())), word_bits=32)
+def _settings(
+    plan: str,
+    *,
+    directions: float,
+    last_range_m: float,
+    microphones: float,
+    microphones_in_a_square_grid: float = 0.0,
+) -> tuple[Settings, int]:
+    """Return settings and words per sample, with microphones at random positions on a disc, or in a grid."""
+    n_mics, settings = int(microphones_in_a_square_grid or microphones), Settings.from_preset(_PRESET)
+    if microphones_in_a_square_grid:
+        places_m = _PITCH_M * (np.indices((round(n_mics**0.5),) * 2).reshape(2, -1).T - (n_mics**0.5 - 1) / 2)
+    else:
+        random = np.random.default_rng(1)
+        radius_m, angle_rad = _APERTURE_M / 2 * np.sqrt(random.random(n_mics)), 2 * np.pi * random.random(n_mics)
+        places_m = np.stack([radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)], axis=1)
+    positions_m = np.column_stack([np.zeros(n_mics), places_m])
+    array = Array(layout=f"array of {n_mics}", positions_m=tuple(map(tuple, positions_m.tolist())), word_bits=32)
     processing = settings.processing.replace(
         directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m)), wavefront="plane"
     )
@@ -181,7 +195,9 @@ def form(report: dict[str, Any]) -> str:
         f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
         f"{timing.BURST}. Other values are 1850 directions, 0.5–5 m, 32 microphones and all threads. Each line has "
         "the default plan for its settings. If a precision is named, every direction is summed without a beam grid, "
-        "with one sample per microphone. A batch contains several measurements, and the time is that of one of them. "
+        "with one sample per microphone. Microphones are at random places on a disc of 10 cm, or in a grid of "
+        f"{1e3 * _PITCH_M:g} mm; wavefronts are plane. "
+        "A batch contains several measurements, and the time is that of one of them. "
         "Every image was compared with the exact one before it was timed; "
         "warm-up calls of a fifth of a second are excluded. "
         "Limits are the best of as many runs, over arrays of 64 MiB and in "
