@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.base.errors import ArgumentError, DataError
 
-__all__ = ["ROUNDING_DB", "LevelCodes", "as_dtype", "rounding_np"]
+__all__ = ["MAX_STEP_DB", "ROUNDING_DB", "LevelCodes", "as_dtype", "rounding_np"]
 
+MAX_STEP_DB: Final = 10.0
 _STEP_DB: Final = 0.5
 _LAST: Final = 255
 _TOP_DBFS: Final = 5.0  # One-bit sound at full scale reaches 2.1 dBFS.
 _QUIET_DB: Final = 30.0  # Level above the floor, below which a single image has a scale of its own.
+_QUIETEST_DBFS: Final = -600.0  # Levels of single precision, whose logarithms are exact enough, begin here.
 _OCTAVE_DB: Final = 20 * math.log10(2)
 
 
@@ -34,10 +36,10 @@ class LevelCodes(NamedTuple):
             made = cls(float(floor_db), float(step_db))  # type: ignore[arg-type]
         except (TypeError, ValueError):
             made = cls(math.nan)
-        if not (abs(made.floor_db) <= 1000 and 0 < made.step_db <= 10):
+        if not (abs(made.floor_db) <= 1000 and 0 < made.step_db <= MAX_STEP_DB):
             raise DataError(
                 f"{source} has 8-bit levels from {floor_db} dB in steps of {step_db} dB; state finite numbers, the "
-                "step from 0 to 10 dB"
+                f"step from 0 to {MAX_STEP_DB:g} dB"
             )
         return made
 
@@ -52,7 +54,7 @@ class LevelCodes(NamedTuple):
         is_quiet = not headroom_db and level_db < usual.floor_db + _QUIET_DB
         if level_db <= _TOP_DBFS - headroom_db and not is_quiet:
             return usual
-        return cls.up_to(level_db + headroom_db)
+        return cls.up_to(max(level_db + headroom_db, _QUIETEST_DBFS))
 
     @classmethod
     def up_to(cls, level_db: float) -> Self:

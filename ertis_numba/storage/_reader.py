@@ -5,8 +5,9 @@ import operator
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
+from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, ClassVar, Self, TypeVar, overload
+from typing import ClassVar, Self, TypeVar, overload
 
 import h5py
 
@@ -15,7 +16,7 @@ from ertis_numba.base.file_kinds import kind_of, problem_of, quoted
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage.opening import RESULT_OR_RECORDING, open_binary, open_file, reading
+from ertis_numba.storage.opening import RESULT_OR_RECORDING, Source, open_binary, open_file, reading
 from ertis_numba.storage.schema import FORMAT_VERSION, OLDEST_VERSION, Variable, content_sha256
 from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import GroundTruth, read_truth
@@ -39,7 +40,7 @@ def file_kind(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> str:
         return _kind(file, Path(path), wanted)
 
 
-def sensor_names(path: str | Path | BinaryIO, wanted: str = RESULT_OR_RECORDING) -> tuple[str, ...]:
+def sensor_names(path: Source, wanted: str = RESULT_OR_RECORDING) -> tuple[str, ...]:
     """Return the names of the sensors in a recording or a result of processing, in the order of the file.
 
     Raises
@@ -79,9 +80,9 @@ class FileReader(Sequence[Item]):
     _data: str
     _table: tuple[Variable, ...]
 
-    def __init__(self, path: str | Path | BinaryIO, *, sensor: str | None = None) -> None:
+    def __init__(self, path: Source, *, sensor: str | None = None) -> None:
         self.path = _place(path)
-        self._binary = None if isinstance(path, str | Path) else path
+        self._binary = None if isinstance(path, str | PathLike) else path
         self._file = _opened(path, _KIND_NAMES[self._kind])
         try:
             with self._reading():
@@ -233,16 +234,18 @@ class FileReader(Sequence[Item]):
             )
 
 
-def _place(path: str | Path | BinaryIO) -> Path:
+def _place(path: Source) -> Path:
     """Return the path of a file, or the last part of the name of a file object; those of fsspec have a ``path``."""
-    if isinstance(path, str | Path):
+    if isinstance(path, str | PathLike):
         return Path(path)
     names = (getattr(path, each, None) for each in ("path", "name"))  # a pipe has a number as its name
     return Path(next((Path(name).name for name in names if isinstance(name, str)), "file object"))
 
 
-def _opened(path: str | Path | BinaryIO, wanted: str) -> h5py.File:
-    return open_file(Path(path), wanted) if isinstance(path, str | Path) else open_binary(path, _place(path), wanted)
+def _opened(path: Source, wanted: str) -> h5py.File:
+    return (
+        open_file(Path(path), wanted) if isinstance(path, str | PathLike) else open_binary(path, _place(path), wanted)
+    )
 
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import h5py
 import numpy as np
@@ -15,6 +15,7 @@ from ertis_numba.frames import AcousticMap, Bearing, known_levels
 from ertis_numba.settings import Settings
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
 from ertis_numba.storage._rows import RowWriter
+from ertis_numba.storage.opening import Source
 from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import ACOUSTIC_MAP, BEARINGS, POSES, Variable
 from ertis_numba.storage.variables import create_variables, set_attributes, to_python
@@ -208,7 +209,7 @@ class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
         return super()._sizes() | BEARING_SIZES
 
 
-def open_acoustic_maps(path: str | Path | BinaryIO, *, sensor: str | None = None) -> AcousticMapReader:
+def open_acoustic_maps(path: Source, *, sensor: str | None = None) -> AcousticMapReader:
     """Open a file of acoustic maps for reading.
 
     Parameters

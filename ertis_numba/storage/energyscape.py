@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import h5py
 import numpy as np
@@ -15,10 +15,12 @@ from ertis_numba.base import checks
 from ertis_numba.base.constants import IMAGE_DTYPES, ImageDtype
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.frames.level_codes import MAX_STEP_DB
 from ertis_numba.storage._levels import encoded, levels_for, levels_of, stored_levels
 from ertis_numba.storage._points import POINT_SIZES, PointReader, require_uniform, write_points
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
 from ertis_numba.storage._rows import RowReader, RowWriter
+from ertis_numba.storage.opening import Source
 from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import (
     ENERGYSCAPE,
@@ -188,7 +190,7 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         if self._is_levels:
             self._levels[first.stamp.sensor] = levels = levels_for(first)
             set_attributes(group[self._data], stored_levels(levels))
-        elif first.level_step_db:
+        if first.level_step_db:
             set_attributes(group, {"level_step_db": first.level_step_db})
 
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
@@ -303,8 +305,10 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
         super()._load()
         stated = self._group.attrs
         self._levels = levels_of(self._group[self._data], self.path) if self._is_levels else None
-        step_db = self._levels.step_db if self._levels else stated.get("level_step_db", 0.0)
-        self.level_step_db = _number(self.path, "level_step_db", step_db)
+        step_db = _number(self.path, "level_step_db", stated.get("level_step_db", 0.0))
+        if not 0 <= step_db <= MAX_STEP_DB:
+            raise DamagedError(f"{self.path}: level_step_db is {step_db:g}; use 0 to {MAX_STEP_DB:g}")
+        self.level_step_db = max(step_db, self._levels.step_db if self._levels else 0.0)
         for name in _ERRORS_DB:
             setattr(self, name, _number(self.path, name, stated[name]) if name in stated else None)
         for name in _TEXTS:
@@ -348,7 +352,7 @@ def _number(path: Path, name: str, value: Any) -> float:
     return found
 
 
-def open_energyscapes(path: str | Path | BinaryIO, *, sensor: str | None = None) -> EnergyscapeReader:
+def open_energyscapes(path: Source, *, sensor: str | None = None) -> EnergyscapeReader:
     """Open an energyscape file for reading.
 
     Parameters

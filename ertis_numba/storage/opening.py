@@ -6,16 +6,18 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, TypeAlias
 
 import h5py
 
 from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, SettingsError
 from ertis_numba.base.file_kinds import HDF5_PLACES, HDF5_SIGNATURE, problem_of, quoted
 
-__all__ = ["RESULT_OR_RECORDING", "open_binary", "open_file", "reading"]
+__all__ = ["RESULT_OR_RECORDING", "Source", "open_binary", "open_file", "reading"]
 
+Source: TypeAlias = str | PathLike[str] | BinaryIO
 RESULT_OR_RECORDING: Final = "a recording, an energyscape file or a file of acoustic maps"
 # Errors of h5py for damaged files, and for types and values that this package does not expect.
 _DAMAGED = (OSError, RuntimeError, LookupError)
@@ -107,11 +109,17 @@ def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
 
 def open_binary(file: BinaryIO, path: Path, wanted: str) -> h5py.File:
     """Open an HDF5 file through a binary file object, such as one of fsspec; ``path`` names it in errors."""
+    if not hasattr(file, "seekable"):
+        raise ArgumentError(f"path is {type(file).__name__}; pass a path or a binary file object")
+    if file.closed:
+        raise DataError(f"{path} is closed; open it again")
     if not (file.seekable() and file.readable() and isinstance(file.read(0), bytes)):
         raise DataError(f"{path} is not a binary file that can be read at any place; open a seekable one, mode 'rb'")
     try:
         return h5py.File(file, "r")
     except OSError as error:
+        if error.errno is not None:
+            raise DataError(f"{path} cannot be read ({error.strerror or error}); check its connection") from error
         raise DataError(f"{path} is not {wanted}, or is cut short ({_reason(error)}); copy it again") from error
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
@@ -29,6 +29,7 @@ from ertis_numba.storage._poses import (
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
+from ertis_numba.storage.opening import Source
 from ertis_numba.storage.recording_variables import (
     AIR,
     axis_sizes,
@@ -124,7 +125,7 @@ class RecordingReader(FileReader[Measurement]):
                 )
 
 
-def open_recording(path: str | Path | BinaryIO, *, sensor: str | None = None) -> RecordingReader:
+def open_recording(path: Source, *, sensor: str | None = None) -> RecordingReader:
     """Open a recording for reading.
 
     Parameters

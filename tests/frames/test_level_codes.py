@@ -99,6 +99,13 @@ def test_images_without_a_level_have_the_usual_scale(highest):
     assert LevelCodes.of(np.full((1, 2), highest, np.float32)) == USUAL
 
 
+def test_levels_near_zero_are_below_the_floor():
+    amplitude = np.array([[0.0, 1e-40, 1e-45]], dtype=np.float32)
+    codes = LevelCodes.of(amplitude)
+    assert LevelCodes.checked(*codes, "message") == codes
+    assert not codes.encode(amplitude).any()
+
+
 def test_other_types_have_no_scale():
     amplitude = np.full((2, 3), 0.1, np.float32)
     same, none = as_dtype(amplitude, "float32")

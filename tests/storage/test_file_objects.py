@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.base.errors import DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Settings
 from ertis_numba.storage import sensor_names
@@ -138,3 +138,28 @@ def test_pipe_and_text_are_refused(path):
         for file, name in ((pipe, "file object"), (text, "noise.h5")):
             with pytest.raises(DataError, match=f"^{name} is not a binary file that can be read at any place"):
                 ertis.open_recording(file)
+
+
+def test_closed_file_and_other_objects_are_refused(path):
+    with path.open("rb") as file:
+        pass
+    with pytest.raises(DataError, match=r"^noise\.h5 is closed; open it again"):
+        ertis.open_recording(file)
+    with pytest.raises(ArgumentError, match="^path is NoneType; pass a path or a binary file object"):
+        ertis.open_recording(None)
+
+
+def test_path_like_object_is_a_path(path):
+    with os.scandir(path.parent) as entries:
+        (entry,) = entries
+    with ertis.open_recording(entry) as recording:
+        assert recording.path == path
+
+
+def test_timeout_on_opening_is_not_called_damage(path):
+    class Late(io.BytesIO):
+        def readinto(self, _):
+            raise TimeoutError(110, "Connection timed out")
+
+    with pytest.raises(DataError, match=r"^file object cannot be read \(Connection timed out\)"):
+        ertis.open_recording(Late(path.read_bytes()))

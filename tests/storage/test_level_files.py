@@ -100,6 +100,19 @@ def test_float_files_keep_the_step_of_rounded_levels(tmp_path):
         write_energyscapes(tmp_path / "other.h5", [rounded, given])
 
 
+def test_8_bit_files_keep_the_step_of_coarser_levels(tmp_path):
+    levels = LevelCodes(-122.0, 3.0)
+    given = image()
+    rounded = given.replace(amplitude=levels.decode(levels.encode(given.amplitude)), level_step_db=3.0)
+    path = write_energyscapes(tmp_path / "img.h5", [rounded], dtype="uint8")
+    with open_energyscapes(path) as images:
+        assert images[0].level_step_db == 3.0
+    with h5py.File(path, "r+") as file:
+        file["sensors/sensor"].attrs["level_step_db"] = -1.0
+    with pytest.raises(DamagedError, match="level_step_db is -1; use 0 to 10"):
+        open_energyscapes(path)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "match"),
     [
