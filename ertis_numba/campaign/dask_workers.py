@@ -21,7 +21,10 @@ _REPORT_INTERVAL_S: Final = 0.5
 
 
 class DaskWorkerPool:
-    """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker."""
+    """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
+
+    A worker of one thread receives its next task early, so that it does not wait for the scheduler and this client.
+    """
 
     # Workers need the same versions and paths of files. Anyone who reaches a scheduler can run code on its workers.
 
@@ -36,7 +39,7 @@ class DaskWorkerPool:
             stack.enter_context(cluster.silence_loggers())
             stack.callback(self._client.close, timeout=2)
             cluster.require_workers(self._client, address, timeout_s=_CONNECT_S)
-            self._size = len(self._client.nthreads())
+            self._count()
             self._client.subscribe_topic(self._topic, self._advance)
             self._stack = stack.pop_all()
         self._looked_s = time.monotonic()
@@ -49,7 +52,7 @@ class DaskWorkerPool:
     @property
     def free(self) -> int:
         """Number of tasks that can be given now."""
-        return max(0, self._size - len(self._futures))  # Workers may have been lost.
+        return max(0, self._size + self._n_early - len(self._futures))  # Workers may have been lost.
 
     def limit(self, size: int) -> None:
         """Do nothing: each worker of a cluster has its own device."""
@@ -93,6 +96,11 @@ class DaskWorkerPool:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures.values()), force=True)
 
+    def _count(self) -> None:
+        """Count the workers; those of several threads would begin an early task at once, beside another one."""
+        threads: list[int] = [*self._client.nthreads().values()]
+        self._size, self._n_early = max(1, len(threads)), threads.count(1)
+
     def _advance(self, event: tuple[Any, dict[str, Any]]) -> None:
         """Process a message of a task; runs in the thread of the client."""
         _, reported = event
@@ -104,7 +112,7 @@ class DaskWorkerPool:
             return
         self._looked_s = time.monotonic()
         try:
-            self._size = max(1, len(self._client.nthreads()))
+            self._count()
         except (OSError, TimeoutError):  # The scheduler may return. Otherwise the status of the client changes.
             return
 

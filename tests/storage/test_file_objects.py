@@ -145,7 +145,7 @@ def test_closed_file_and_other_objects_are_refused(path):
         pass
     with pytest.raises(DataError, match=r"^noise\.h5 is closed; open it again"):
         ertis.open_recording(file)
-    with pytest.raises(ArgumentError, match="^path is NoneType; pass a path or a binary file object"):
+    with pytest.raises(ArgumentError, match=r"^path is NoneType; pass a path or a binary file object"):
         ertis.open_recording(None)
 
 

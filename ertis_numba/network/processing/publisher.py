@@ -21,13 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["Publisher"]
 
 _MODULE: Final = "ertis_numba.network.processing.publisher_process"
-# By default, the GNU C library returns the memory of large blocks and requests it again, with a page fault for
-# each 4 KiB: 3600 for an image of 14 MB, or 5 of its 12 ms. Keeping the memory leaves 100 page faults.
-_KEEP_MEMORY: Final = {
-    "MALLOC_MMAP_THRESHOLD_": str(32 * 2**20),
-    "MALLOC_TRIM_THRESHOLD_": str(256 * 2**20),
-    "MALLOC_ARENA_MAX": "1",
-}
 _STARTED_S: Final = 60.0
 _HUNG_S: Final = 10.0  # Limit on silence; it sends a message each second.
 _DELAYS_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -43,7 +36,7 @@ class Publisher:
         self.subscribers: tuple[SubscriberStatus, ...] = ()
         self.refused: dict[str, int] = {}
         self._refused_before: dict[str, int] = {}
-        self._process = SupervisedProcess[FromPublisher](_MODULE, FromPublisher, _DELAYS_S, _KEEP_MEMORY)
+        self._process = SupervisedProcess[FromPublisher](_MODULE, FromPublisher, _DELAYS_S)
         self._serves = False
         self._points: tuple[str, ...] | None = ()
         self._jobs: dict[int, Job] = {}
