@@ -276,7 +276,10 @@ def _placement(reader: "_Reader") -> dict[str, Any]:
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
     """Return the step of rounded levels, and the predicted error and the error budget, if the file contains them."""
-    rounded = {"level_step_db": reader.level_step_db} if reader.level_step_db else {}
+    from ertis_numba.frames.level_codes import rounding_db
+
+    step_db = reader.level_step_db
+    rounded = {"level_step_db": step_db, "rounding_error_db": round(rounding_db(step_db), 2)} if step_db else {}
     if reader.predicted_error_db is None:
         return rounded
     texts = {name: getattr(reader, name) for name in ("budget_applies_to", "error_warning")}

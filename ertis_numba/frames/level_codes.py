@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.base.errors import ArgumentError, DataError
 
-__all__ = ["MAX_STEP_DB", "ROUNDING_DB", "LevelCodes", "as_dtype", "rounding_np"]
+__all__ = ["MAX_STEP_DB", "ROUNDING_DB", "LevelCodes", "as_dtype", "rounding_db", "rounding_np"]
 
 MAX_STEP_DB: Final = 10.0
 _STEP_DB: Final = 0.5
@@ -103,5 +103,10 @@ def rounding_np(step_db: float) -> float:
     return step_db * math.log(10) / 20 / math.sqrt(12)
 
 
-ROUNDING_DB: Final = 20 * math.log10(rounding_np(_STEP_DB))
-"""Error of images by the rounding of their levels, relative to the images."""
+def rounding_db(step_db: float) -> float:
+    """Return the error of an image by rounding of its levels to a step, relative to the image, in dB."""
+    return 20 * math.log10(rounding_np(step_db))
+
+
+ROUNDING_DB: Final = rounding_db(_STEP_DB)
+"""Rounding error of 8-bit images."""
