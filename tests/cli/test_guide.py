@@ -232,10 +232,15 @@ def test_code_of_the_gpu_page_runs(place):
 def test_code_of_the_formats_page_runs(place):
     """In a separate process, because netCDF-C and h5py each have their own HDF5."""
     (place / "REC.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
-    (code,) = python_in(page("formats"))
+    run_here(place, "process REC.h5 -o IMG.h5 --dtype uint8 --quiet")
+    code, of_levels = python_in(page("formats"))
     (*_, last) = code.splitlines()
     reported = run(place, sys.executable, "-c", code.replace(last, f"print(dict({last}.sizes))")).stdout
     assert "'sample'" in reported
+    reported = run(place, sys.executable, "-c", of_levels + "\nprint(level_db.dtype, float(level_db.max()))").stdout
+    kind, highest_db = reported.split()
+    assert kind.startswith("float")
+    assert -30 < float(highest_db) < -28  # -28.9 dB
 
 
 def test_code_of_the_network_page_runs(place):
